@@ -20,6 +20,10 @@ from arcade_torch.agents.checked import (
 )
 
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
+MOST_EPISODES = 2**16
+"""Of an evaluation. They are played side by side, one an environment: the frames of one step of so
+many take 3 GB at 128 pixels.
+"""
 # Names that are no options, because other fields decide them and learners rely on them.
 OF_ENV = (
     "id",
@@ -46,6 +50,7 @@ OF_NETWORK = (
 DEVICE = re.compile(r"cpu(:0)?|cuda(:(0|[1-9][0-9]{0,2}))?")
 Device = Annotated[str, Range("'cpu', 'cuda' or one of several such as 'cuda:0'", DEVICE.fullmatch)]
 Seed = Annotated[int, Range(f"in [0, {SEED_LIMIT})", lambda x: 0 <= x < SEED_LIMIT)]
+Episodes = Annotated[int, Range(f"from 1 to {MOST_EPISODES}", lambda x: 1 <= x <= MOST_EPISODES)]
 TimeLimit = Literal["bootstrap", "terminal"]
 Bootstrap = Literal["next", "last"]
 
@@ -86,8 +91,9 @@ class LearnerConfig(Checked):
     average_share: Fraction = 0.0
     """The weights that act and are saved are a mean of those that learn, over about this share of
     the updates so far (polynomial decay: Shamir & Zhang, arXiv 1212.1824). The share grows with the
-    training return: none at the lowest that the game can pay, all of it at the highest, a fourth
-    power between (``agents.learner.window_share``). 0: no mean.
+    training return: none at the lowest that the game can pay, all of it at the highest, between
+    them by the fourth power, or a higher one in games that pay less than 0 (``window_share`` in
+    ``agents/learner.py``). 0: no mean.
     """
     warmup_steps: CountOrZero = 0
     """Random steps of each environment before training, not counted as frames; they calibrate the
@@ -297,7 +303,7 @@ class TrainConfig(Checked):
     obs_size: Count = 128
     """Height and width of the frames, pixels."""
     rules: Literal["default", "reference"] = "default"
-    """Law of the games; ``"reference"`` is the one the published numbers were made with."""
+    """Rules of the games; ``"reference"``: those that the published numbers were made with."""
     env_options: Options = field(default_factory=dict)
     """Further options of the game."""
     memory: Text = "lru"
@@ -305,7 +311,9 @@ class TrainConfig(Checked):
     network without any.
     """
     network: Text = "paper"
-    """Network preset around the memory model: ``"paper"`` or ``"small"``."""
+    """Network preset around the memory model: ``"paper"``, ``"small"`` or ``"small64"``, which sees
+    64 instead of 32 pixels.
+    """
     network_options: Options = field(default_factory=dict)
     """Further options of ``make_network``."""
     algorithm: Literal["pqn", "ppo", "dqn"] = "pqn"
@@ -332,7 +340,7 @@ class TrainConfig(Checked):
     """
     eval_every: CountOrZero = 1_000_000
     """Frames between greedy evaluations; 0 evaluates only at the end."""
-    eval_episodes: Annotated[int, Range("from 1 to 65536", lambda x: 1 <= x <= 2**16)] = 128
+    eval_episodes: Episodes = 128
     """Episodes of each evaluation, one in each of as many fresh environments."""
     checkpoint_every: CountOrZero = 500_000
     """Frames between checkpoints; 0 saves only at the end and when interrupted."""

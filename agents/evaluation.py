@@ -9,16 +9,11 @@ from numpy.typing import NDArray
 
 import arcade_torch
 from arcade_torch.agents.checked import require
-from arcade_torch.agents.config import SEED_LIMIT, TrainConfig
+from arcade_torch.agents.config import MOST_EPISODES, SEED_LIMIT, TrainConfig
 from arcade_torch.agents.metrics import student_half_width
 from arcade_torch.agents.torch_settings import plain_torch
 from arcade_torch.envs_jax.checks import check_ends
 from arcade_torch.envs_jax.registry import is_mixture, resolve_id
-
-MOST_EPISODES = 2**16
-"""Episodes are played side by side, one an environment: the frames of one step of so many take 3 GB
-at 128 pixels.
-"""
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ def evaluating(module: nn.Module) -> Iterator[None]:
 def state_of(
     state: TensorDictBase | Tensor | None, initial_state: Callable[[int], Any], rows: int
 ) -> Any:
-    """The recurrent state that is meant: as it is, from floats [B, F], or the initial one."""
+    """The recurrent state that is given, or is made of floats [B, F]; else the initial one."""
     if state is None:
         return initial_state(rows)
     if isinstance(state, Tensor):

@@ -25,9 +25,9 @@ def ewm(values: ArrayLike, span: float = EWM_SPAN) -> NDArray[np.float64]:
     return smooth
 
 
-def student_half_width(values: ArrayLike, confidence: float = 0.95) -> float:
-    """Half the width of Student's interval of the mean of some values; NaN where one value alone
-    gives none.
+def student_half_width(values: ArrayLike) -> float:
+    """Half the width of Student's 95 % interval of the mean of some values; NaN where one value
+    alone gives none.
 
     Example:
         >>> round(student_half_width([0.0, 1.0]), 2), student_half_width([0.5])
@@ -38,7 +38,7 @@ def student_half_width(values: ArrayLike, confidence: float = 0.95) -> float:
     numbers = np.asarray(values, dtype=np.float64)
     if numbers.size < 2:
         return float("nan")
-    quantile = stdtrit(numbers.size - 1, (1 + confidence) / 2)
+    quantile = stdtrit(numbers.size - 1, 0.975)
     return float(quantile * numbers.std(ddof=1) / np.sqrt(numbers.size))
 
 

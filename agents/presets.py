@@ -113,7 +113,7 @@ def preset(name: str, **changes: Any) -> TrainConfig:
       AutoEncode, 20 M else.
     * ``reference``: ``paper`` as its published code behaves: time limits end like terminations, the
       last step of a window is trained in the next (PQN), targets are stored (DQN), no last action
-      (PPO), no skip connection around the memory, the games' law of the published numbers.
+      (PPO), no skip connection around the memory, the rules of the published numbers.
     * ``small``: a small network and PPO, made for the ten Easy games in ten minutes of one core
       (results/small.md; results/recipe.md says how it was chosen). PQN and DQN learn CartPoleEasy,
       SkittlesEasy, MineSweeperEasy with it. Time limits end like terminations; PPO's memory also

@@ -231,8 +231,10 @@ class QLambdaEstimator(TDLambdaEstimator):
         return returns.unsqueeze(-1)
 
 
-READ = ("action", "is_init", "reward", "done", "terminated", "truncated")
-WRITTEN = ("advantage", "value_target")
+_READ = ("action", "is_init", "reward", "done", "terminated", "truncated")
+"""Entries of a batch that :class:`SequenceGAE` reads, by our names; others may be set."""
+_WRITTEN = ("advantage", "value_target")
+"""Entries that it writes, beside ``value``."""
 
 
 class SequenceGAE(nn.Module):
@@ -266,7 +268,7 @@ class SequenceGAE(nn.Module):
         self.gamma = discount("gamma", gamma)
         self.lmbda = discount("lmbda", lmbda)
         self.chunks = chunks
-        self.names: dict[str, Any] = {key: key for key in (*READ, *WRITTEN)}
+        self.names: dict[str, Any] = {key: key for key in (*_READ, *_WRITTEN)}
         self.names["value"] = "state_value"
 
     def set_keys(self, **names: Any) -> None:
@@ -287,7 +289,7 @@ class SequenceGAE(nn.Module):
             params: parameters of the critic; default those it has.
             target_params: not looked at.
         """
-        names = {name: self.names[name] for name in READ}
+        names = {name: self.names[name] for name in _READ}
         data = insert_final_observations(batch, self.inputs, self.time_limit, **names)
         opened: Any = nullcontext()
         if params is not None:

@@ -80,7 +80,7 @@ class Trainer:
         config = self.config
         numbers = config.learner
         self.network = build_network(config)  # learns
-        # is saved, too
+        # acts, is evaluated and saved: a mean of the weights, or the network that learns itself
         self.acting = build_network(config) if numbers.average_share else self.network
         for network in {self.network, self.acting} if config.compile else ():
             compile_network(network, COMPILE_BACKEND)

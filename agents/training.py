@@ -131,13 +131,13 @@ class _Run:
             self.trainer.warm_up()
         path = self.folder.path
         frames = self.trainer.frames
+        # a run that lacks nothing but its last evaluation is evaluated again
+        evaluated = frames - 1 if self.trainer.done else frames
         with (
             closing(
                 CsvLog(path / "metrics.csv", METRIC_COLUMNS, keep_frames=frames)
             ) as self.metrics,
-            closing(
-                CsvLog(path / "eval.csv", self._eval_columns(), frames - self.trainer.done)
-            ) as self.evals,
+            closing(CsvLog(path / "eval.csv", self._eval_columns(), evaluated)) as self.evals,
             closing(RunLogger(self.config, path, frames)) as self.logger,
         ):
             try:
@@ -145,12 +145,10 @@ class _Run:
                 return self._loop()
             except NonFiniteError as error:
                 self._report("failed", error=str(error))
-                newest = list_checkpoints(self.folder.checkpoints)[:1]
-                left = (
-                    f"the last good checkpoint is {newest[0]}"
-                    if newest
-                    else "there was no checkpoint yet"
-                )
+                checkpoints = list_checkpoints(self.folder.checkpoints)
+                left = "there was no checkpoint yet"
+                if checkpoints:
+                    left = f"the last good checkpoint is {checkpoints[0]}"
                 raise NonFiniteError(f"{error}; {left}") from error
             except OSError as error:  # a full disk, for one
                 with suppress(OSError):
@@ -171,8 +169,8 @@ class _Run:
     def _not_written(self, error: OSError) -> str:
         """What could not be written, what is safe, and how to go on."""
         where = error.filename or self.folder.path
-        newest = list_checkpoints(self.folder.checkpoints)[:1]
-        safe = f"{newest[0].name} is whole" if newest else "there is no checkpoint yet"
+        checkpoints = list_checkpoints(self.folder.checkpoints)
+        safe = f"{checkpoints[0].name} is whole" if checkpoints else "there is no checkpoint yet"
         full = error.errno in (errno.ENOSPC, errno.EDQUOT)
         too_large = error.errno == errno.EFBIG
         cure = "make room" if full else "raise ulimit -f" if too_large else "put that right"
@@ -246,8 +244,9 @@ class _Run:
             for row in read_csv(self.folder.path / "metrics.csv", strict=False)
             if row["train_return_last"]
         ]
-        points = [[float(row[name]) for row in rows] for name in ("frames", "train_return_last")]
-        score = paper_score(points[0], points[1]) if rows else None
+        frames = [float(row["frames"]) for row in rows]
+        returns = [float(row["train_return_last"]) for row in rows]
+        score = paper_score(frames, returns) if rows else None
         final = {
             "status": "finished",
             "frames": self.trainer.frames,

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from arcade_torch.envs_jax import Game, MixedGames, resolve_id
+from arcade_torch.envs_jax import Game, MixedGames
 from arcade_torch.envs_jax import make as make_game
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, choose_rows
-from arcade_torch.envs_jax.registry import games_of, is_mixture
+from arcade_torch.envs_jax.registry import games_of
 from arcade_torch.envs_jax.settings import compiled
 from arcade_torch.envs_jax.validation import format_value, plain
 from arcade_torch.frame_memory import Canvas, Spare
@@ -130,8 +130,8 @@ class CompiledGame:
         return (memory, *leaves)
 
     def calls_back(self, batch: Batch) -> bool:
-        """Whether a step of this batch runs Python code of a game, or what else may fail while it
-        runs.
+        """Whether a step of this batch calls Python or foreign code of a game, which may fail while
+        the step runs.
         """
         if self._calls_back is None:
             action = np.zeros(len(batch.step_count), np.int32)
@@ -218,8 +218,9 @@ def compiled_game(
             nor a list.
     """
     # what a bare name means may change
-    is_one = isinstance(id, str) and not is_mixture(id)
-    ids = resolve_id(id) if is_one else _checked(id)  # type: ignore[arg-type]
+    games = _resolved_ids(id)
+    is_one = isinstance(id, str) and len(games) == 1  # a list of one is a mixture
+    ids = games[0] if is_one else games
     obs_size = plain(obs_size)
     options = {name: plain(options[name]) for name in sorted(options)}
     try:
@@ -232,8 +233,10 @@ def compiled_game(
     return compiled
 
 
-def _checked(ids: Any) -> tuple[str, ...]:
-    """The games of a mixture, each as often as it has shares; refuses what is no list of ids."""
+def _resolved_ids(ids: Any) -> tuple[str, ...]:
+    """The games that are named, with their versions, each as often as it has shares; refuses what
+    is no list of ids.
+    """
     if isinstance(ids, str):
         return games_of(ids)
     if not isinstance(ids, Sequence) or isinstance(ids, bytes):

@@ -23,7 +23,7 @@ def note(env: Any, seed: int | None, plays: Hashable) -> None:
 
 
 def forget(env: Any) -> None:
-    """It was seeded, or is known to have begun."""
+    """Watch an env no longer: it has been given a seed."""
     for plays, envs in list(_LIVE.items()):
         envs.discard(env)
         if not envs:

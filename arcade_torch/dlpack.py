@@ -31,8 +31,10 @@ def is_host(value: jax.Array | jax.Device | torch.device) -> bool:
     """Whether something is on the CPU, where the host reads memory without waiting for a
     transfer.
     """
-    kind = value.type if isinstance(value, torch.device) else value.platform
-    return (kind() if callable(kind) else kind) == "cpu"
+    if isinstance(value, torch.device):
+        return value.type == "cpu"
+    platform = value.platform  # a method of JAX's arrays, an attribute of its devices
+    return (platform() if callable(platform) else platform) == "cpu"
 
 
 def to_torch(array: jax.Array | np.ndarray, device: torch.device | None = None) -> torch.Tensor:

@@ -47,6 +47,7 @@ class Live:
 
 
 _UNCHECKED = {"validated": True, "inplace": False, "non_blocking": False}
+"""For ``TensorDict._set_str``: an entry that needs no check. ``set`` takes eight times as long."""
 
 
 class ArcadeEnv(BaseEnv):
@@ -512,7 +513,7 @@ class ArcadeEnv(BaseEnv):
         counts = raw.root_numbers(("is_init", "step_count", "episode_reward"))
         ends = torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
         for key, value in self._entries(raw.pixels, last_action, counts, ends).items():
-            root._set_str(key, value, **_UNCHECKED)  # set() takes eight times as long
+            root._set_str(key, value, **_UNCHECKED)
         return tensordict, root
 
     def _keys(self, seed: int) -> jax.Array:

@@ -43,7 +43,7 @@ class FinalObservations:
         """Keep the state that a step led to, before the resets, under a number; and who saw the
         partial view.
         """
-        (final_state, partial) = final
+        final_state, partial = final
         self._states[index] = self._split_states(final_state)
         self._partial = partial
 

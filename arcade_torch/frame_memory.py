@@ -40,7 +40,8 @@ class Reused:
         """Remember that ``array`` lies over the block, and return it; the oldest block too many is
         forgotten.
         """
-        self._blocks = [*self._blocks[1 - self._most :], (block, weakref.ref(array))]
+        newest = self._blocks[-(self._most - 1) :]
+        self._blocks = [*newest, (block, weakref.ref(array))]
         return array
 
 

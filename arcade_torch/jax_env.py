@@ -26,9 +26,9 @@ from arcade_torch.suite import Outcome, Suite, name_of
 __all__ = ["JaxEnv", "from_jax"]
 
 _OWN_KEYS = (
-    *("action", "last_action", "is_init", "step_count", "episode_reward"),
-    *("reward", "done", "terminated", "truncated", "next", "_reset", "_step"),
-)
+    "action", "last_action", "is_init", "step_count", "episode_reward",
+    "reward", "done", "terminated", "truncated", "next", "_reset", "_step",
+)  # fmt: skip
 
 
 class Episodes(NamedTuple):
@@ -86,11 +86,11 @@ class JaxEnv(BaseEnv):
         one_action = suite_actions.action_of_one(self.action_spec)
         self._action_dtype = one_action.dtype
         suite.check(one_action)
-        self._begin = jax.jit(self._first)
-        self._reset_rows = jax.jit(self._begin_anew)
-        self._step_alone = jax.jit(self._advance)
-        self._step_fused = jax.jit(self._advance_and_begin_anew)
-        self._step_packed = jax.jit(self._advance_and_pack)
+        self._compiled_begin = jax.jit(self._begin)
+        self._compiled_begin_anew = jax.jit(self._begin_anew)
+        self._compiled_advance = jax.jit(self._advance)
+        self._compiled_advance_and_begin_anew = jax.jit(self._advance_and_begin_anew)
+        self._compiled_advance_and_pack = jax.jit(self._advance_and_pack)
         self._live: Episodes
         self._ends: torch.Tensor | None
         self._count = 0
@@ -206,7 +206,7 @@ class JaxEnv(BaseEnv):
         Raises:
             ValueError: Actions of a wrong shape or out of range.
         """
-        live, final, numbers = self._step_packed(self._live, self._argument(action))
+        live, final, numbers = self._compiled_advance_and_pack(self._live, self._argument(action))
         if while_computing is not None:
             while_computing()
         self._go_on(live)
@@ -289,10 +289,10 @@ class JaxEnv(BaseEnv):
 
         Keys go as in gymnax's own ``step``: one for the step, one for the episode after it.
         """
-        key, use = _split(live.key)
-        now, reset_key = _split(use)
+        key, of_this_step = _split(live.key)
+        step_key, reset_key = _split(of_this_step)
         count = live.step_count + 1
-        obs, state, outcome = jax.vmap(self.suite.step)(now, live.state, action, count)
+        obs, state, outcome = jax.vmap(self.suite.step)(step_key, live.state, action, count)
         total = live.episode_reward + outcome.reward
         return Episodes(key, reset_key, state, obs, action, count, total), outcome
 
@@ -325,9 +325,9 @@ class JaxEnv(BaseEnv):
         wait_for_torch(self.device, self._jax_device)
         with jax.default_device(self._jax_device):  # on another GPU than the first one, too
             keys = jax.device_put(env_keys(seed, self.num_envs), self._jax_device)
-            self._go_on(self._begin(keys))
+            self._go_on(self._compiled_begin(keys))
 
-    def _first(self, keys: jax.Array) -> Episodes:
+    def _begin(self, keys: jax.Array) -> Episodes:
         """Episodes that begin."""
         key, reset_key = _split(keys)
         obs, state = jax.vmap(self.suite.reset)(reset_key)
@@ -344,12 +344,12 @@ class JaxEnv(BaseEnv):
         ends = None if rows.all() else self._ends
         if ends is not None:
             ends = ends & ~torch.from_numpy(rows).to(self.device).unsqueeze(-1)
-        self._go_on(self._reset_rows(self._live, rows), ends)
+        self._go_on(self._compiled_begin_anew(self._live, rows), ends)
         return self._root()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = validation.tensor(tensordict, "action")
-        after, outcome = self._step_alone(self._live, self._argument(action))
+        after, outcome = self._compiled_advance(self._live, self._argument(action))
         if self._waits_for_reset():
             after, outcome = self._stay_at_ends(after, outcome)
         following: TensorDictBase = self._next(after, outcome, action)
@@ -375,7 +375,8 @@ class JaxEnv(BaseEnv):
                 self.__dict__["_ends"] = None  # whatever had ended has begun anew
             return stock
         action = validation.tensor(tensordict, "action")
-        live, after, outcome = self._step_fused(self._live, self._argument(action))
+        argument = self._argument(action)
+        live, after, outcome = self._compiled_advance_and_begin_anew(self._live, argument)
         self._go_on(live)
         following = self._next(after, outcome, action)
         validation.keep_what_was_written(tensordict, following)

@@ -15,8 +15,8 @@ def _before_fork() -> None:
     """Note that JAX has started: here, or in a process that this one was forked from."""
     global _started_in
     bridge = sys.modules.get("jax._src.xla_bridge")
-    # bool() is false
-    if _started_in is None and getattr(bridge, "backends_are_initialized", bool)():
+    has_started = getattr(bridge, "backends_are_initialized", None)
+    if _started_in is None and has_started is not None and has_started():
         _started_in = os.getpid()
 
 

@@ -120,7 +120,7 @@ class RolloutBuffer:
             self._new_observation[key] = TensorMemory(window, entry, device)
             self._new_dense[key] = TensorMemory(window, entry, device)
             self._new_final[key] = TensorMemory(places, entry, device)
-        self._extra_shapes: dict[NestedKey, tuple[tuple[int, ...], torch.dtype]] = {}
+        self._extra_entries: dict[NestedKey, Entry] = {}
         self._task = None if task is None else task.unsqueeze(-1).repeat(1, self.length)
         # whose final observation is kept
         self._wanted = np.zeros((num_envs, self.length), np.bool_)
@@ -145,7 +145,7 @@ class RolloutBuffer:
         }
         self._extras = {
             key: torch.zeros((*size, *shape), dtype=dtype, device=device)
-            for key, (shape, dtype) in self._extra_shapes.items()
+            for key, (shape, dtype) in self._extra_entries.items()
         }
         # the observation after every step, made when it is asked for
         self._dense: dict[NestedKey, torch.Tensor] | None = None
@@ -175,12 +175,23 @@ class RolloutBuffer:
         if not reuse:
             self._allocate()
         self._wanted = np.zeros_like(wanted)
-        # the next window begins with it
+        # also where nobody wants them now: the overlap of the next window begins with them
         self._fills_dense = dense or bool(self.overlap and self.final_frames == "all")
         if self._fills_dense and self._dense is None:
             self._dense = _taken(self._new_dense)
-        if not carry:
-            return self._first
+        if carry:
+            self._carry_overlap(before, final, wanted)
+        return self._first
+
+    def _carry_overlap(
+        self,
+        before: Mapping[NestedKey, torch.Tensor],
+        final: Mapping[NestedKey, torch.Tensor],
+        wanted: np.ndarray,
+    ) -> None:
+        """Put the last steps of the window before in front of this one: its buffers, final
+        observations, and whose were wanted.
+        """
         for key, target in self._buffers().items():
             if key in self._kept:
                 target[:, : self.overlap] = self._kept[key]
@@ -201,7 +212,6 @@ class RolloutBuffer:
             source_place = upload(then, self.device)
             for key, places in self._final.items():
                 places[row, target_place] = final[key][row, source_place]
-        return self._first
 
     def place(self, step: int) -> Place | None:
         """Where the ``pixels`` that a step sees may be drawn; None on a GPU, or if the window ends
@@ -242,14 +252,13 @@ class RolloutBuffer:
         """Write what the policy wants stored; space is made at the first step."""
         for key, value in extras.items():
             if key not in self._extras:
-                self._add_extra(key, value.shape[1:], value.dtype)
+                self._add_extra(key, Entry(tuple(value.shape[1:]), value.dtype))
             self._extras[key][:, step] = value
 
-    def _add_extra(self, key: NestedKey, shape: tuple[int, ...], dtype: torch.dtype) -> None:
-        self._extra_shapes[key] = tuple(shape), dtype
-        self._extras[key] = torch.zeros(
-            (self.num_envs, self.length, *shape), dtype=dtype, device=self.device
-        )
+    def _add_extra(self, key: NestedKey, entry: Entry) -> None:
+        self._extra_entries[key] = entry
+        size = (self.num_envs, self.length, *entry.shape)
+        self._extras[key] = torch.zeros(size, dtype=entry.dtype, device=self.device)
 
     def finish(
         self, root: Mapping[NestedKey, torch.Tensor], last: Mapping[NestedKey, torch.Tensor]
@@ -456,7 +465,7 @@ class RolloutBuffer:
             kind, *path = name.split("/")
             if kind == "extras" and tuple(path) not in map(path_of, self._extras):
                 key = tuple(path) if len(path) > 1 else path[0]
-                self._add_extra(key, buffer.shape[2:], buffer.dtype)
+                self._add_extra(key, Entry(tuple(buffer.shape[2:]), buffer.dtype))
         if self.final_frames == "all":
             self._dense = _taken(self._new_dense)
         ours = self._overlap_buffers() | _by_path(self._final, "final")

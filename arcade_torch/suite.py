@@ -47,8 +47,8 @@ class Suite:
         self.env = env
         self.params = params
         self.extra = () if params is None else (params,)
-        self._begin = _function(env, "reset")
-        self._go_on = _function(env, "step")
+        self._reset_function = _function(env, "reset")
+        self._step_function = _function(env, "step")
         self.tells_truncation = callable(getattr(env, "is_truncated", None))
         if max_steps is None and not self.tells_truncation:
             max_steps = _limit_of(params)
@@ -56,7 +56,7 @@ class Suite:
 
     def reset(self, key: jax.Array) -> tuple[Any, Any]:
         """The first observation and state of an episode."""
-        result = self._begin(key, *self.extra)
+        result = self._reset_function(key, *self.extra)
         if not isinstance(result, tuple | list) or len(result) != 2:
             raise ContractError(
                 f"reset of {name_of(self.env)} gives {described(result)}, expected a tuple of "
@@ -69,7 +69,7 @@ class Suite:
         self, key: jax.Array, state: Any, action: jax.Array, count: jax.Array
     ) -> tuple[Any, Any, Outcome]:
         """Take the step number ``count`` of an episode, from 1 on: observation, state, outcome."""
-        result = self._go_on(key, state, action, *self.extra)
+        result = self._step_function(key, state, action, *self.extra)
         if not isinstance(result, tuple) or len(result) not in (5, 6):
             raise ContractError(
                 f"step of {name_of(self.env)} gives {described(result)}, expected observation, "

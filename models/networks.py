@@ -326,7 +326,8 @@ class MemoryNetwork(TensorDictModuleBase):
         """
         features = self.encode(sequences["pixels"])
         is_init = sequences["is_init"].squeeze(-1)
-        last_action = sequences["last_action"] if self.num_actions else is_init
+        # a network without a last action looks at none
+        last_action = sequences["last_action"] if self.num_actions else torch.empty(0)
         first = self.initial_state(len(sequences))
         if state is not None and self.state_keys:
             first.update(state[self.state_key])

@@ -153,7 +153,8 @@ def make_network(
     _check_memory_options(memory, memory_options or {})
     if store == "step" and "zero_action_on_reset" not in options:
         settings = replace(settings, zero_action_on_reset=False)
-    num_outputs += 0 if value_key is None else 1
+    if value_key is not None:
+        num_outputs += 1
     parts = _parts(settings, memory, memory_options or {}, obs_size, num_outputs, num_actions)
     names: dict[str, Any] = {"out_key": out_key, "value_key": value_key, "state_key": state_key}
     return MemoryNetwork(**parts, **names, store=store)

@@ -73,7 +73,7 @@ class Recurrence:
         self._empty = _empty_nodes(example)
         self.state_keys = list(self._paths)
         self.next_state_keys = [("next", *key) for key in self.state_keys]
-        begins_with_zeros = not any(_begins_with_more(x) for x in tensors.values())
+        begins_with_zeros = not any(_is_learned_or_not_zero(x) for x in tensors.values())
         if store == "step" and not begins_with_zeros:
             raise ValueError(
                 "store='step' needs a memory that begins with zeros and learns no start: take "
@@ -138,34 +138,35 @@ class Recurrence:
             self.checks.check_order(tensordict, is_init)
         elif self.state_keys:
             self.checks.check_state(tensordict, is_init, self.state_keys)
-        rows = (shape[:-1].numel(), shape[-1]) if recurrent else (shape.numel(),)
+        # [B, T] in recurrent mode, else [B], whatever the batch dimensions of the tensordict
+        flat = (shape[:-1].numel(), shape[-1]) if recurrent else (shape.numel(),)
         if x.ndim == 0 or x.shape[:-1].numel() != shape.numel():
             raise ValueError(
                 f"x is {list(x.shape)} in a batch of shape {list(shape)}, expected one vector a "
                 "step: flatten pictures, and give several agents a batch dimension"
             )
-        x = x.reshape(*rows, x.shape[-1])
-        is_init = is_init.reshape(rows)
+        x = x.reshape(*flat, x.shape[-1])
+        is_init = is_init.reshape(flat)
         if torch.is_autocast_enabled(x.device.type):
             x = x.float()
 
         with torch.autocast(x.device.type, enabled=False):
             if not recurrent:
-                state = self._stored_state(memory, tensordict, rows)
+                state = self._stored_state(memory, tensordict, flat)
                 y, after = memory(x.unsqueeze(1), state, is_init.unsqueeze(1))
             elif self.store == "step":
-                states = self._stored_state(memory, tensordict, rows)
+                states = self._stored_state(memory, tensordict, flat)
                 y, after = replay(memory, x, states, is_init)
             else:
                 first_step = tensordict.select(*self.state_keys, strict=False)[..., 0]
-                state = self._stored_state(memory, first_step, rows[:1])
+                state = self._stored_state(memory, first_step, flat[:1])
                 y, after = memory(x, state, is_init)
 
         writes_states = not recurrent or self.store == "step"
         if writes_states:
             for key, path in self._paths.items():
                 value = after.get(path)
-                tensordict.set(("next", *key), value.reshape(*shape, *value.shape[len(rows) :]))
+                tensordict.set(("next", *key), value.reshape(*shape, *value.shape[len(flat) :]))
         return y.reshape(*shape, y.shape[-1])  # type: ignore[no-any-return]
 
     def make_primer(self, memory: nn.Module) -> "TensorDictPrimer":
@@ -181,23 +182,23 @@ class Recurrence:
         return TensorDictPrimer(primers, expand_specs=True)
 
     def _stored_state(
-        self, memory: nn.Module, tensordict: TensorDictBase, rows: tuple[int, ...]
+        self, memory: nn.Module, tensordict: TensorDictBase, flat: tuple[int, ...]
     ) -> TensorDict:
-        """The states in a tensordict, with the batch shape ``rows``; the initial state where one is
-        missing.
+        """The states in a tensordict, with the batch shape ``flat``, [B] or [B, T]; the initial
+        state where one is missing.
         """
-        state = TensorDict({}, batch_size=rows)
+        state = TensorDict({}, batch_size=flat)
         for key, path in self._paths.items():
             value = tensordict.get(key, None)
             if value is not None:
-                value = value.reshape(*rows, *value.shape[tensordict.ndim :])
+                value = value.reshape(*flat, *value.shape[tensordict.ndim :])
             else:
-                value = memory.initial_state(rows[0]).get(path)  # type: ignore[operator]
-                if len(rows) == 2:
-                    value = value.unsqueeze(1).expand(*rows, *value.shape[1:])
+                value = memory.initial_state(flat[0]).get(path)  # type: ignore[operator]
+                if len(flat) == 2:
+                    value = value.unsqueeze(1).expand(*flat, *value.shape[1:])
             state.set(path, value)
         for path in self._empty:
-            state.set(path, TensorDict({}, batch_size=rows))
+            state.set(path, TensorDict({}, batch_size=flat))
         return state
 
 
@@ -289,7 +290,7 @@ def _tensors(state: TensorDictBase) -> dict[tuple[str, ...], Tensor]:
     return tensors
 
 
-def _begins_with_more(start: Tensor) -> bool:
+def _is_learned_or_not_zero(start: Tensor) -> bool:
     """Whether a tensor of the first state is learned or has an entry that is not 0; one without
     data (on the meta device) has none.
     """

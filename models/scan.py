@@ -82,11 +82,9 @@ def _check(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor | None) -> Non
     """Raise ValueError unless the shapes are those that :func:`linear_scan` documents."""
     if b.ndim < 2 or b.shape[1] == 0:
         raise ValueError(f"b must be [B, T, ...] with T >= 1, got shape {list(b.shape)}")
-    fits = (
-        all(n in (1, m) for n, m in zip(a.shape[::-1], b.shape[::-1], strict=False))
-        and a.ndim <= b.ndim
-    )
-    if not fits:
+    sizes = zip(reversed(a.shape), reversed(b.shape), strict=False)
+    broadcasts = a.ndim <= b.ndim and all(of_a in (1, of_b) for of_a, of_b in sizes)
+    if not broadcasts:
         raise ValueError(
             f"a of shape {list(a.shape)} does not broadcast to b of shape {list(b.shape)}"
         )
@@ -106,11 +104,10 @@ def _keep(h0: Tensor, start: Tensor | None) -> Tensor:
     """h0 where the first step does not begin an episode; selected, so that a stale NaN does not
     come through.
     """
-    return (
-        h0
-        if start is None
-        else h0.masked_fill(start[:, :1].reshape((-1,) + (1,) * (h0.ndim - 1)), 0)
-    )
+    if start is None:
+        return h0
+    begins = start[:, 0].reshape(-1, *(1,) * (h0.ndim - 1))
+    return h0.masked_fill(begins, 0)
 
 
 def _load_stored_states(
@@ -125,6 +122,7 @@ def _load_stored_states(
 
 
 _forced: str | None = None
+"""The back end that :func:`back_end` has chosen; None: that of the device."""
 
 
 @torch.library.custom_op("arcade_torch::linear_scan", mutates_args=())
@@ -225,11 +223,9 @@ def scan_backward_doubling(
 ) -> tuple[Tensor, Tensor]:
     """The backward pass in the doubling form: a forward scan over flipped time."""
     shifted = torch.conj_physical(torch.cat([a[:, :1], a[:, 1:].flip(1)], dim=1))
-    begins = (
-        None
-        if start is None
-        else torch.cat([torch.zeros_like(start[:, :1]), start[:, 1:].flip(1)], dim=1)
-    )
+    begins = None
+    if start is not None:
+        begins = torch.cat([torch.zeros_like(start[:, :1]), start[:, 1:].flip(1)], dim=1)
     grad_b = scan_doubling(shifted, grad.flip(1), begins, torch.zeros_like(h0)).flip(1).contiguous()
     before = torch.cat([h0.unsqueeze(1), h[:, :-1]], dim=1)
     grad_a = torch.where(_closed_at_starts(start, a), 0, grad_b * torch.conj_physical(before))

@@ -5,7 +5,7 @@ import importlib
 import re
 import shlex
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -224,6 +224,24 @@ def test_links_between_pages_lead_somewhere(page: Path) -> None:
         assert not anchor or anchor in anchors(linked), f"{name(page)} links to {target}"
 
 
+def test_files_of_the_repository_that_a_page_names_are_there() -> None:
+    folders = ("agents", "arcade_torch", "envs_jax", "models", "tools", "tests", "examples")
+    ours = re.compile(rf"`((?:{'|'.join(folders)})/[\w/.-]+\.\w+)`")
+    for page in PAGES:
+        if page.name == "CHANGELOG.md":  # what it names was there once
+            continue
+        for path in ours.findall(page.read_text(encoding="utf-8")):
+            assert (ROOT / path).exists(), f"{name(page)} names {path}"
+
+
+def test_the_index_of_results_names_all_of_them() -> None:
+    index = (ROOT / "results/README.md").read_text(encoding="utf-8")
+    made_by_hand = {"README.md", "gpu.md", "bench.json", "bench.md"}  # the last three by make
+    for path in (ROOT / "results").iterdir():
+        stem = path.name.rpartition(".")[0] or path.name
+        assert path.name in made_by_hand or stem in index, f"results/README.md: {path.name}"
+
+
 def test_the_table_of_environments_is_true() -> None:
     from arcade_torch.envs_jax import make, registered_ids
 
@@ -270,3 +288,87 @@ def test_every_layer_and_name_of_the_readme_exists() -> None:
         assert hasattr(models, public)
     for folder in first_cells(section(ROOT / "docs/architecture.md", "Layers")):
         assert (ROOT / folder.rstrip("/")).is_dir()
+
+
+def test_the_files_of_a_step_are_those_of_the_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    import arcade_torch
+    from arcade_torch import compiled
+
+    part = section(ROOT / "docs/architecture.md", "One step of an environment")
+    rows = [path.replace("<game>", "minesweeper") for path in first_cells(part)]
+    monkeypatch.setattr(compiled, "_compile", compiled._compile.__wrapped__)  # compile it anew
+    env = arcade_torch.make("MineSweeperEasy", num_envs=2)
+    root = env.rand_action(env.reset())
+    seen: dict[str, None] = {}
+
+    def note(frame: Any, event: str, argument: object) -> None:
+        seen.setdefault(frame.f_code.co_filename)
+
+    sys.setprofile(note)
+    try:
+        env.step(root)
+    finally:
+        sys.setprofile(None)
+    ours = [file for file in seen if "site-packages" not in file and not file.startswith("<")]
+    paths = [Path(file).resolve() for file in ours]
+    opened = [path.relative_to(ROOT).as_posix() for path in paths if path.is_relative_to(ROOT)]
+    assert [path for path in opened if path in rows] == rows
+    others = {path.removeprefix("arcade_torch/") for path in opened if path not in rows}
+    assert others - {"tests/test_docs.py"} <= set(re.findall(r"`([\w/]+\.py)`", part))
+
+
+def test_the_presets_on_the_page_are_those_that_there_are() -> None:
+    from arcade_torch.agents import preset, preset_names
+
+    text = (ROOT / "docs/guides/training.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `(\w+)` \| (\w+) \| (\w+) \| ([\d,]+) \|", text, re.MULTILINE)
+    assert sorted(row[0] for row in rows) == preset_names()
+    for chosen, algorithm, network, frames in rows:
+        config = preset(chosen, env="SkittlesEasy")
+        assert (config.algorithm, config.network) == (algorithm, network)
+        assert config.total_frames == int(frames.replace(",", ""))
+
+
+def test_variables_of_the_shell_that_are_read_are_on_a_page() -> None:
+    text = "".join(page.read_text(encoding="utf-8") for page in PAGES)
+    reads = re.compile(r"environ(?:\.get|\.setdefault)?[(\[]\s*\"([A-Z_]+)\"")
+    read = set()
+    for folder in ("agents", "arcade_torch", "envs_jax", "models", "tools"):
+        for path in (ROOT / folder).rglob("*.py"):
+            read |= set(reads.findall(path.read_text(encoding="utf-8")))
+    known_to_all = {"COLUMNS", "PYGAME_HIDE_SUPPORT_PROMPT", "PYTHONOPTIMIZE", "TERM"}
+    assert len(read) > 4
+    for variable in read - known_to_all:
+        assert f"`{variable}" in text, variable
+
+
+def test_the_keys_of_a_study_on_the_page_are_those_that_it_takes() -> None:
+    from dataclasses import fields
+
+    from arcade_torch.tools.studies.grid import Study
+
+    part = section(ROOT / "docs/cluster.md", "The file of a study")
+    first = re.findall(r"^\| (`.+?`) \|", part, re.MULTILINE)
+    named = {key for cell in first for key in re.findall(r"`(\w+)`", cell)}
+    assert named == {field.name for field in fields(Study)}
+
+
+def test_the_arguments_of_make_on_the_page_are_those_that_it_takes() -> None:
+    import inspect
+
+    import arcade_torch
+
+    named = first_cells(section(ROOT / "docs/environments.md", "What `make` takes"))
+    taken = list(inspect.signature(arcade_torch.make).parameters)
+    taken.remove("partial_obs")  # stands beside what it is an alias of
+    assert named == taken
+
+
+def test_the_columns_of_human_scores_on_the_page_are_those_that_are_written() -> None:
+    from arcade_torch.tools.play.scores import COLUMNS
+
+    text = (ROOT / "docs/play.md").read_text(encoding="utf-8").split("### Scores of people")[1]
+    first = re.findall(r"^\| (`.+?`) \|", text, re.MULTILINE)
+    assert tuple(column for cell in first for column in re.findall(r"`(\w+)`", cell)) == COLUMNS

@@ -282,33 +282,30 @@ def is_final(values: Any, needed: Sequence[str] = ()) -> bool:
     """Whether ``values``, with all ``needed`` keys, is what the ``eval.json`` of a finished run
     holds.
     """
-    if (
-        not isinstance(values, dict)
-        or values.get("status", "finished") != "finished"
-        or not set(needed) <= set(values)
-    ):
+    if not isinstance(values, dict) or not set(needed) <= set(values):
+        return False
+    if values.get("status", "finished") != "finished":
         return False
     returns = values.get("returns", [])
     lengths = values.get("lengths", [])
-    if (
-        not (isinstance(returns, list) and isinstance(lengths, list))
-        or values.get("mean", returns or None) is None
-    ):
+    if not isinstance(returns, list) or not isinstance(lengths, list):
         return False
-    others = [
-        values.get(name)
-        for name in ("mean", "std", "ci", "n", "frames", "seconds", "train_max_ewm")
-    ]
-    numbers = [*returns, *lengths, *(value for value in others if value is not None)]
+    has_mean = values["mean"] is not None if "mean" in values else bool(returns)
+    if not has_mean:
+        return False
+
+    numbers = [*returns, *lengths]
+    for name in ("mean", "std", "ci", "n", "frames", "seconds", "train_max_ewm"):
+        if values.get(name) is not None:
+            numbers.append(values[name])
     # what can be squared; NaN is one
-    sound = all(type(n) in (int, float) and not abs(n) > 1e15 for n in numbers)
-    if not sound or not all(type(n) is int for n in lengths):
+    if not all(type(n) in (int, float) and not abs(n) > 1e15 for n in numbers):
         return False
-    if any((values.get(name) or 0) < 0 for name in ("frames", "seconds")):
-        return False
-    if {"returns", "lengths"} <= set(values) and not 0 < len(returns) == len(lengths):
-        return False
-    return not wrong_mean(values)
+
+    are_whole = all(type(length) is int for length in lengths)
+    are_pairs = 0 < len(returns) == len(lengths) or not {"returns", "lengths"} <= set(values)
+    is_negative = any((values.get(name) or 0) < 0 for name in ("frames", "seconds"))
+    return are_whole and are_pairs and not is_negative and not wrong_mean(values)
 
 
 def wrong_mean(values: Any) -> str:

@@ -42,7 +42,7 @@ _MOST_FIELDS = 8
 """Settings that are named where two runs differ; an agent of another preset differs in 30."""
 
 
-# in place, so never behind a link
+# what a run writes and removes in place, so that none of it may be a link
 _WRITTEN = (LOCK, "checkpoints", "replay", "tensorboard", "wandb", "wandb_id.txt")
 
 

@@ -203,8 +203,7 @@ class NumpyBatch:
         stepped = Stepped(paid, terminated > 0, truncated > 0, info)
         ended = stepped.terminated | stepped.truncated
         self._finals.add(0, (step.final_state, step.root.partial))
-        drawn = [
-            np.asarray(drawn["pixels"])[counting]
-            for _, _, drawn, counting in self._finals.draw(ended[:, None])
-        ]
-        return stepped, frames, np.flatnonzero(ended), np.concatenate([frames[:0], *drawn])
+        final_frames = [frames[:0]]  # where no episode ended there are none, of the same shape
+        for _, _, drawn, counting in self._finals.draw(ended[:, None]):
+            final_frames.append(np.asarray(drawn["pixels"])[counting])
+        return stepped, frames, np.flatnonzero(ended), np.concatenate(final_frames)

@@ -3,6 +3,7 @@ interruption.
 """
 
 import json
+import re
 import subprocess
 import sys
 import time
@@ -61,9 +62,13 @@ def test_every_command_explains_itself_with_an_example(
     name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert cli.main([*name.split(), "--help"]) == cli.EXIT_OK
-    text = " ".join(capsys.readouterr().out.split())
+    text = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert f"usage: arcade-torch {name}" in text
     assert f"Example: arcade-torch {name}" in text
+    assert not re.findall(r"(--[\w.-]*\w)(?: [A-Z]+)? \(default", text), "an option without a word"
+    # under --no-report, "Write the report. (default: True)" would say what the option does not do
+    options = text.partition(" -h, --help ")[2]  # usage and description stand above
+    assert set(re.findall(r"\B--no-[\w-]+ (\w+)", options)) <= {"Whether"}
 
 
 @pytest.mark.parametrize(

@@ -1,8 +1,11 @@
 """`arcade-torch list memories` says what every model costs, and the counts are exact."""
 
 import pytest
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
 
-from arcade_torch.models import make_memory, memory_names
+from arcade_torch.models import RecurrentMemory, make_memory, memory_names
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench.memory import memory_cost, time_memories
 
@@ -58,3 +61,24 @@ def test_times_are_positive_and_learning_a_batch_takes_longer_than_acting_it() -
     assert set(times) == {"gru", "mlp"}
     assert all(acting > 0 and learning > 0 for acting, learning in times.values())
     assert times["gru"][1] > times["mlp"][1]
+
+
+def test_products_inside_of_a_fused_lstm_count() -> None:
+    memory = RecurrentMemory(nn.LSTM(8, 16, batch_first=True), 8, 16)
+    assert memory_cost(memory, 8).products == (8 + 16) * 4 * 16
+
+
+class LastInput(nn.Module):
+    """Somebody's memory without a weight: the input of the step before."""
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        before = torch.cat([state["x"].unsqueeze(1), x[:, :-1]], dim=1)
+        y = before.masked_fill(is_init.unsqueeze(-1), 0)
+        return y, TensorDict({"x": x[:, -1].clone()}, batch_size=[len(x)])
+
+    def initial_state(self, batch_size: int) -> TensorDict:
+        return TensorDict({"x": torch.zeros(batch_size, 8)}, batch_size=[batch_size])
+
+
+def test_a_memory_without_a_weight_costs_its_state() -> None:
+    assert memory_cost(LastInput(), 8) == (0, 8, 32, 0)

@@ -2,6 +2,7 @@
 saliency; costs.
 """
 
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -54,7 +55,8 @@ class Options(BenchOptions):
     Example: arcade-torch bench memory lru gru --steps 132 --layers 1 --out runs/memory.csv
     """
 
-    memories: tuple[str, ...] = ()  # Memory models; all of them by default.
+    memories: tuple[str, ...] = ()
+    """Memory models, which may stand first without this word; all of them by default."""
     steps: tuple[int, ...] = (132, 1024)  # Lengths of the sequences.
     layers: tuple[int, ...] = (1, 2)  # Cells one above the other.
     size: int = 512  # Width of input and output.
@@ -278,10 +280,15 @@ def memory_cost(memory: nn.Module, input_size: int) -> MemoryCost:
     """Count what a memory model needs."""
     state = memory.initial_state(1)  # type: ignore[operator]
     leaves = list(state.values(True, True))
-    parameter = next(memory.parameters())
-    x = parameter.new_zeros(1, 1, input_size)
-    is_init = torch.zeros(1, 1, dtype=torch.bool, device=parameter.device)
-    with FlopCounterMode(display=False) as counter, torch.no_grad():
+    weight = next(memory.parameters(), torch.zeros(()))
+    x = weight.new_zeros(1, 1, input_size)
+    is_init = torch.zeros(1, 1, dtype=torch.bool, device=weight.device)
+    with (
+        warnings.catch_warnings(action="ignore"),  # mkldnn warns of GPUs that are not there
+        torch.backends.mkldnn.flags(enabled=False),  # whose kernels of nn.LSTM count nothing
+        FlopCounterMode(display=False) as counter,
+        torch.no_grad(),
+    ):
         memory(x, state, is_init)
     state_size = sum(leaf.numel() for leaf in leaves), sum(leaf.nbytes for leaf in leaves)
     return MemoryCost(

@@ -84,7 +84,8 @@ class Options(BenchOptions):
     """
 
     resumable: ClassVar[bool] = True
-    memories: tuple[str, ...] = ()  # Memory models; all of them by default.
+    memories: tuple[str, ...] = ()
+    """Memory models, which may stand first without this word; all of them by default."""
     tests: tuple[TestName, ...] = ("symbol",)  # What they are asked; symbol stands alone.
     delays: tuple[int, ...] = (8, 32, 96)  # Of symbol: steps between symbol and question.
     hidden_size: int = 64  # Width of the memory block.

@@ -46,13 +46,13 @@ class Options(BenchOptions):
     env: str = "MineSweeperEasy"  # The game; its POMDP twin is played.
     device: str = "cpu"  # Torch device of the network.
     forms: tuple[str, ...] = ("eager",)
-    """How networks are run: eager, amp, compiled, graphs (CUDA graphs while acting), or several
-    joined by "+".
+    """How networks are run: eager, amp, compiled, graphs (CUDA graphs of acting and of gradient
+    steps), or several joined by "+".
     """
     threads: int = 0  # Torch threads; 0 leaves the setting alone.
     grad_steps: int = 4  # Gradient steps in each timed pass; those of an update are all alike.
     repeats: int = 3  # Passes; the median counts.
-    # Have the C library keep freed memory, as train does and a loop of your own does not.
+    # Whether the C library keeps freed memory, as train does and a loop of your own does not.
     keep_memory: bool = True
 
 

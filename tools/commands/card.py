@@ -13,8 +13,6 @@ from arcade_torch.tools.options import Command, at_least, command_line
 from arcade_torch.tools.progress import Bars
 from arcade_torch.tools.text import say
 
-PARTS_BEFORE_TRAINING = 5
-
 
 @dataclass
 class Card(Command):
@@ -33,13 +31,14 @@ class Card(Command):
     names: tyro.conf.Positional[tuple[str, ...]] = ()
     """Memory models; by default the only one that --import registers."""
     all: bool = False  # All that are registered.
-    tests: bool = True  # Train it in the tests of memory, where no results are on file.
+    # Whether it is trained in the tests of memory, where no results are on file.
+    tests: bool = True
     study: bool = False  # Train agents with it.
     frames: int = FRAMES  # Of each run of the study.
     games: tuple[str, ...] = GAMES  # Of the study, on both twins.
     seeds: int = SEEDS  # Of each agent of the study.
     workers: int = 0  # Runs of the study at once; 0 for one a core.
-    html: bool = True  # Write the page, not the JSON alone.
+    html: bool = True  # Whether the page is written beside the JSON.
     out: Path = Path("cards")  # Folder of the files: NAME.html and NAME.json.
 
     def run(self) -> int:

@@ -43,7 +43,7 @@ class Compare(Resumable):
     out: Path | None = None  # Folder of the study; runs/compare-MEMORY by default.
     workers: int = 0  # Runs at once; 0 for one a core.
     skip: tuple[Part, ...] = ("contamination",)  # Parts that the report leaves out, see report.
-    # Check the laws that a memory has to keep before models of yours are trained.
+    # Whether the laws that a memory has to keep are checked before models of yours are trained.
     check_memory: bool = True
 
     def run(self) -> int:

@@ -34,7 +34,7 @@ class Push(Command):
     """Repository owner/name; or a folder: one that is there, or a name that begins with . or /"""
     episodes: int = 1024  # Greedy ones, for the results.
     half: bool = False  # Store the weights as float16; both returns stand in results.json.
-    film: bool = True  # Write a film of an episode.
+    film: bool = True  # Whether a film of an episode is written.
     private: bool = False  # Make a private repository.
     message: str = "Add an agent"  # Of the commit.
 

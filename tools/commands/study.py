@@ -104,15 +104,15 @@ class StudyCommand(Resumable):
     workers: int = 0  # Runs at once; 0 for one a core, or for what the Ray cluster has room for.
     ray: Annotated[RayOptions, tyro.conf.arg(name="")] = field(default_factory=RayOptions)
     shard: str = ""
-    """3/10 carries out the third tenth of the runs, for the array jobs of a scheduler; all write
-    into one folder.
+    """3/10 carries out the third, thirteenth, ... of the runs, for the array jobs of a scheduler;
+    all write into one folder.
     """
     dry_run: bool = False  # Only print every run with its frames, and the frames of all together.
     # The agent that the report is about and compares with every other; that of the file by default.
     subject: str = ""
-    # Check the laws that a memory has to keep before models of yours are trained.
+    # Whether the laws that a memory has to keep are checked before models of yours are trained.
     check_memory: bool = True
-    # Write the HTML report at the end; of shards, the one that finishes the study writes it.
+    # Whether an HTML report is written at the end; of shards, by the one that finishes the study.
     report: bool = True
 
     def run(self) -> int:

@@ -51,8 +51,10 @@ class Train(Command):
     resume: bool = False  # Go on with the run in that folder.
     # Seconds to wait until another process that trains in that folder has stopped.
     wait: float = 0.0
-    # Check the laws that a memory has to keep before a model of yours is trained (about a second).
     check_memory: bool = True
+    """Whether the laws that a memory has to keep are checked before a model of yours is trained
+    (about a second).
+    """
     videos: Literal["none", "gif", "mp4"] = "none"
     """Film one greedy episode at every evaluation into the run folder's videos/; mp4 needs the
     extra video.

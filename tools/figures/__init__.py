@@ -25,7 +25,8 @@ MARKDOWN = ".md"
 class Options:
     """Options that every figure has."""
 
-    runs: tuple[Path, ...] = ()  # Studies, run folders, or folders that hold such.
+    runs: tuple[Path, ...] = ()
+    """Studies, run folders, or folders that hold such; or a table, where a figure reads one."""
     out: Path | None = None
     """Folder for pictures and numbers; or a file, .png, .pdf or .svg for one picture, .csv for the
     numbers alone.

@@ -85,7 +85,8 @@ def greedy_window(
     """Play one greedy episode and return what the agent saw.
 
     Args:
-        agent: as for `resolve_agent`.
+        agent: an agent, or the path of a run folder or checkpoint; with ``env`` given, a TensorDict
+            policy or anything else that `as_policy` takes.
         env: any env of TorchRL, of batch size [] or [1]; by default one of the agent's own game.
         seed: of the episode; without ``env`` that of a held-out environment.
         observability: another twin than the one trained on (without ``env``).

@@ -105,8 +105,8 @@ def study(
         workers: how many runs at once, 0 for one a core.
         command: how the user started this, kept in ``study.json``.
         stream: where progress is shown, stderr by default.
-        shard: ``3/10`` carries out the third tenth of the runs; others, in the same folder, the
-            other tenths.
+        shard: ``3/10`` carries out every tenth run from the third on; others, in the same folder,
+            the other runs.
 
     Returns:
         The rows of ``results.csv`` and the errors of this invocation.

@@ -11,8 +11,7 @@ from arcade_torch.tools.measures import EpisodeOptions
 class BeliefsOptions(EpisodeOptions):
     """Options of probes of the recurrent state."""
 
-    episodes: int = (
-        128  # Greedy episodes of each checkpoint; half fit the probe, a quarter test it.
-    )
+    # Greedy episodes of each checkpoint; half fit the probe, a quarter test it.
+    episodes: int = 128
     max_steps: int = 128  # Steps that are looked at, from the beginning of each episode.
     confidence: float = 0.95  # Of the intervals.

@@ -142,11 +142,13 @@ def beliefs(
     """Read hidden facts off the recurrent state of an agent, and off its frames.
 
     Args:
-        agent: as for `resolve_agent`; ``env`` and ``observability`` too. The env has ``facts()``,
-            as an ``ArcadeEnv`` has.
+        agent: an agent, or the path of a run folder or checkpoint; with ``env`` given, a TensorDict
+            policy or anything else that `as_policy` takes.
+        env: one with ``facts()``, as an ``ArcadeEnv`` has; by default 16 of the agent's own game.
         episodes: greedy episodes.
         max_steps: steps of each that are looked at, from its beginning.
         seed: of the episodes, which training never sees, and of their division.
+        observability: another twin than the one trained on (without ``env``).
         progress: called with (episodes played, episodes).
         **names: keywords of `as_policy`.
 

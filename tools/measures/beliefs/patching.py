@@ -93,11 +93,14 @@ def patching(
     """Exchange recurrent states between greedy episodes of an agent, step by step.
 
     Args:
-        agent: as for `resolve_agent`; ``env`` and ``observability`` too. The env holds two episodes
-            or more, which are one another's donors.
+        agent: an agent, or the path of a run folder or checkpoint; with ``env`` given, a TensorDict
+            policy or anything else that `as_policy` takes.
+        env: of two episodes or more, which are one another's donors; by default 16 of the agent's
+            own game.
         episodes: greedy episodes.
         max_steps: steps of each that are looked at, from its beginning.
         seed: of the episodes, which training never sees, and of the donors.
+        observability: another twin than the one trained on (without ``env``).
         progress: called with (episodes played, episodes).
         **names: keywords of `as_policy`.
 

@@ -94,11 +94,14 @@ def steering(
     """Move the recurrent states of greedy episodes along the directions of all facts.
 
     Args:
-        agent: as for `resolve_agent`; ``env`` and ``observability`` too. The env has ``facts()``,
-            and holds two episodes or more, which are one another's donors.
+        agent: an agent, or the path of a run folder or checkpoint; with ``env`` given, a TensorDict
+            policy or anything else that `as_policy` takes.
+        env: one with ``facts()``, as an ``ArcadeEnv`` has, of two episodes or more, which are one
+            another's donors; by default 16 of the agent's own game.
         episodes: greedy episodes that are moved; as many others give the directions.
         max_steps: steps of each that are looked at, from its beginning.
         seed: of the episodes, which training never sees, of donors and of random directions.
+        observability: another twin than the one trained on (without ``env``).
         progress: called with (episodes played, all of them).
         **names: keywords of `as_policy`.
 
