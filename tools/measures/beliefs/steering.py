@@ -134,6 +134,11 @@ def steering(
             parts.append(part[:, : episodes - group * size])
             if progress is not None:
                 progress(episodes + min(episodes, (group + 1) * size), 2 * episodes)
+    return _joined(parts, directions.names)
+
+
+def _joined(parts: list[Ints], names: list[str]) -> Steering:
+    """The batches of :func:`_steer_batch` as one; shorter ones are filled up."""
     steps = max(part.shape[-1] for part in parts)
     padded = list[Ints]()
     for part in parts:
@@ -141,7 +146,7 @@ def steering(
         padded.append(np.pad(part, missing, constant_values=NOBODY))
     action, donor_action, exchanged, *arms = np.concatenate(padded, axis=1)
     of_facts = np.array(arms, np.int64).reshape(2, -1, *action.shape)
-    facts = np.array(directions.names, dtype=str)
+    facts = np.array(names, dtype=str)
     return Steering(facts, action, donor_action, exchanged, of_facts[0], of_facts[1])
 
 
