@@ -41,6 +41,7 @@ from arcade_torch.agents.runs.files import (
     CheckpointError,
     checksum,
     is_ours,
+    latest_name,
     list_checkpoints,
     open_regular,
     read_bytes,
@@ -200,6 +201,9 @@ def load_latest(
             0.1.
     """
     problems: list[str] = []
+    latest = latest_name(folder)
+    if latest and not os.path.lexists(folder / latest):  # a copy that was not finished, for one
+        problems.append(f"{folder / latest}, the newest by its name in {LATEST}, is missing")
     for path in list_checkpoints(folder):
         try:
             checkpoint = load_checkpoint(path, expect, weights_only)

@@ -270,12 +270,18 @@ def list_checkpoints(folder: Path) -> list[Path]:
     first.
     """
     checkpoints = [path for path in folder.glob("frames-*") if is_ours(path, "checkpoint")]
-    try:
-        latest = read_text(folder / LATEST).strip()
-    except (OSError, ValueError):
-        latest = ""
+    latest = latest_name(folder)
     checkpoints.sort(reverse=True)
     return sorted(checkpoints, key=lambda path: path.name != latest)
+
+
+def latest_name(folder: Path) -> str:
+    """The name in ``latest`` of a ``checkpoints/`` folder; empty if none of a checkpoint is."""
+    try:
+        name = read_text(folder / LATEST).strip()
+    except (OSError, ValueError):
+        return ""
+    return name if is_our_name(name, "checkpoint") else ""
 
 
 def is_final(values: Any, needed: Sequence[str] = ()) -> bool:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import shutil
 
 import pytest
 import torch
@@ -42,6 +43,19 @@ def test_the_last_two_are_kept_and_the_newest_comes_first(tmp_path):
     ]
     assert (tmp_path / "latest").read_text().strip() == "frames-000000000192"
     assert not list(tmp_path.glob(".*"))
+
+
+def test_a_newest_checkpoint_that_was_not_copied_is_told(tmp_path):
+    """A copy that was stopped, or made while the run trained, was another agent without a word."""
+    save(tmp_path, 64, 1.0)
+    shutil.rmtree(save(tmp_path, 128, 2.0))
+    said = "frames-000000000128, the newest by its name in latest, is missing; going on from"
+    with pytest.warns(RuntimeWarning, match=f"{said} frames-000000000064"):
+        assert load_latest(tmp_path).frames == 64
+    (tmp_path / "latest").unlink()
+    assert load_latest(tmp_path).frames == 64
+    (tmp_path / "latest").write_text("../nonsense")
+    assert load_latest(tmp_path).frames == 64
 
 
 @pytest.mark.parametrize("part", ["weights.safetensors", "trainer.pt", "meta.json"])
