@@ -61,6 +61,8 @@ class Output:
         actions = out if self.value_key is None else out[..., :-1]
         if target == "value":
             return actions.amax(-1, keepdim=True) if self.kind == "q" else out[..., -1:]
+        if self.kind == "probs":  # a distribution takes any numbers for shares
+            actions = actions / actions.sum(-1, keepdim=True)
         if self.kind == "logits" and target == "probs":
             return actions.softmax(-1)
         if self.kind == "probs" and target == "logits":

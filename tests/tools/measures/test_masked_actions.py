@@ -4,6 +4,7 @@ no numbers.
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -102,6 +103,27 @@ def test_the_logits_of_probabilities_of_zero_have_no_gradient() -> None:
     assert recall_density(of_probs(), ToyEnv([4]), episodes=1, target="logits").silent == 0
     changes = contamination(of_probs(), ToyEnv([6]), sigmas=(1.0,), delays=(0, 1), starts=4)
     assert np.isfinite(changes.kl).all() and changes.kl[:, 0, 0].max() > 0
+
+
+def test_probabilities_are_shares_as_a_distribution_takes_them() -> None:
+    """Before: gradients of numbers that sum to anything, whose sum no decision depends on."""
+    policy = linear_policy(0.0, dtype=torch.float32, pixel_scale=255.0)
+
+    def weights(pixels: Tensor, softmax: bool) -> Tensor:
+        out, _ = policy.remember(
+            policy.encode(pixels)[:, None], None, torch.ones(len(pixels), 1).bool(), None
+        )
+        return out[:, 0].softmax(-1) if softmax else 7 * out[:, 0].exp()
+
+    shares, numbers = (
+        saliency(
+            TensorDictModule(partial(weights, softmax=softmax), ["pixels"], ["probs"]),
+            window(3).frames,
+        )
+        for softmax in (True, False)
+    )
+    np.testing.assert_allclose(numbers.output, shares.output, rtol=1e-5)
+    np.testing.assert_allclose(numbers.per_frame, shares.per_frame, rtol=1e-4)
 
 
 def test_gradients_that_are_no_numbers_are_refused() -> None:
