@@ -118,7 +118,8 @@ def in_time_order(x: Tensor) -> Tensor:
     """The rows [T B, \\*S] of a tensor [B, T, \\*S], a view if it lies as in
     :func:`time_first`.
     """
-    return x.transpose(0, 1).flatten(0, 1)
+    batch, steps, *shape = x.shape
+    return x.transpose(0, 1).reshape(steps * batch, *shape)  # batched gradients know no flatten
 
 
 def linear_backward(
@@ -130,7 +131,8 @@ def linear_backward(
     rows = in_time_order(grad)
     d_x = None
     if needs_x:
-        d_x = (rows @ weight).unflatten(0, grad.shape[1::-1]).transpose(0, 1)
+        batch, steps = grad.shape[:2]
+        d_x = (rows @ weight).reshape(steps, batch, weight.shape[1]).transpose(0, 1)
     return d_x, rows.t() @ in_time_order(x), rows.sum(0)
 
 

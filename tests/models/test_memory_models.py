@@ -205,6 +205,22 @@ def test_not_even_a_nan_or_infinity_crosses_a_start(name, bad):
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_of_several_outputs_at_once_are_those_of_one_after_the_other(name, dtype):
+    memory = make_memory(name, 3, 4).to(dtype)
+    x = torch.randn(2, 9, 3, dtype=dtype, requires_grad=True)
+    is_init = torch.zeros(2, 9, dtype=torch.bool)
+    is_init[1, 4] = True
+    y, _ = memory(x, memory.initial_state(2), is_init)
+    leaves = [x, *memory.parameters()]
+    directions = torch.randn(3, *y.shape, dtype=dtype)
+    together = torch.autograd.grad(y, leaves, directions, retain_graph=True, is_grads_batched=True)
+    for number, direction in enumerate(directions):
+        alone = torch.autograd.grad(y, leaves, direction, retain_graph=True)
+        torch.testing.assert_close([each[number] for each in together], list(alone))
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_a_batch_of_parameters_under_vmap_equals_one_model_after_another(name):
     models = [make_memory(name, 3, 6).double() for _ in range(3)]
     x, flags = torch.randn(2, 7, 3, dtype=torch.float64), torch.rand(2, 7) < 0.3
