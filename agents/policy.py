@@ -314,9 +314,10 @@ def agent_of(checkpoint: Checkpoint, device: str | torch.device | None = None) -
     try:
         network.load_state_dict(weights)
     except RuntimeError as error:
-        reason = " ".join(str(error).split())
+        reason = " ".join(str(error).split())[:200]  # torch names every weight
         raise CheckpointError(
-            f"the weights in {checkpoint.path} do not fit the network: {reason}"
+            f"the weights in {checkpoint.path} do not fit the network ({reason} ...): they are of "
+            "another version, or config.json was changed; train again, or use what made them"
         ) from error
     if device is None:
         wanted = torch.device(config.device)

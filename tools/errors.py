@@ -3,6 +3,7 @@ traceback; optional packages, imported on first use.
 """
 
 import errno
+import re
 import sys
 from importlib import import_module
 from typing import Any
@@ -131,10 +132,12 @@ def is_of_the_machine(error: BaseException) -> bool:
     """
     if type(error).__name__ in WORK_FAILED:
         return True
+    is_ours = type(error).__module__.startswith("arcade_torch.")
+    cause = error.__cause__ if is_ours else error  # of a run whose disk is full, for one
     return (
-        isinstance(error, OSError)
-        and error.errno in MACHINE
-        and not isinstance(error, PermissionError)
+        isinstance(cause, OSError)
+        and cause.errno in MACHINE
+        and not isinstance(cause, PermissionError)
     )
 
 
@@ -167,8 +170,14 @@ def reason(error: BaseException) -> str:
     return one_line(error) if is_told(error) else f"{type(error).__name__}: {one_line(error)}"
 
 
+_JAX_SETTING = re.compile("for (environment 'JAX_|JAX flag jax_)")
+"""In what JAX says of a value in an environment variable of its own."""
+
+
 def trouble_of_the_machine(error: BaseException) -> str:
-    """What this machine lacks, if that is why JAX or torch raised an error; empty if it is not."""
+    """What this machine or shell lacks, if that is why JAX or torch raised an error; empty if it is
+    not.
+    """
     said = str(error)
     short = (
         "RESOURCE_EXHAUSTED",
@@ -188,4 +197,6 @@ def trouble_of_the_machine(error: BaseException) -> str:
             "TorchRL cannot be loaded by a Python without docstrings: start it with -O in the "
             "place of -OO"
         )
+    if isinstance(error, ValueError) and _JAX_SETTING.search(said):
+        return f"JAX refuses a setting of this shell: {one_line(error)[:200]}"
     return missing_platform()

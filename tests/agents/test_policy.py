@@ -21,7 +21,7 @@ from arcade_torch.agents import (
     preset,
 )
 from arcade_torch.agents.policy import check_network
-from arcade_torch.agents.runs.checkpoint import save_checkpoint
+from arcade_torch.agents.runs.checkpoint import CheckpointError, save_checkpoint
 from arcade_torch.models import make_network, memory_names
 from arcade_torch.tools.measures.windows import resolve_agent
 from tests.agents.fakes import ACTIONS, stream, toy_actor_critic, toy_network, with_two_states
@@ -247,3 +247,15 @@ def test_a_network_is_checked_as_it_is_built_but_without_weights_or_draws(algori
     huge = {"hidden_size": 2**15, "layers": 4}
     check_network(preset("smoke", memory="gru", algorithm=algorithm, network_options=huge))
     assert torch.equal(torch.random.get_rng_state(), drawn)
+
+
+def test_weights_of_a_network_of_another_version_are_refused_with_what_to_do(tmp_path):
+    """Actor and critic of the small preset had a tower each, and torch named all forty weights."""
+    config = preset("smoke", algorithm="ppo", memory="lru")
+    older = build_network(replace(config, network_options={"towers": 2}))
+    save_checkpoint(tmp_path / "checkpoints", config, 0, older.state_dict(), {})
+    with pytest.raises(CheckpointError, match="do not fit the network") as refusal:
+        load(tmp_path)
+    said = str(refusal.value)
+    assert len(said) < 500 and "Missing key" in said
+    assert said.endswith("train again, or use what made them")

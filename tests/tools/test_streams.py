@@ -88,6 +88,18 @@ def test_a_full_disk_under_standard_output_is_one_line(words: str, tmp_path: Pat
     assert "Traceback" not in result.stderr.decode()
 
 
+def test_a_run_that_cannot_be_written_any_more_has_failed_and_is_no_bad_input(
+    tmp_path: Path,
+) -> None:
+    """Array jobs try again by the exit code."""
+    words = "train --preset smoke --total-frames 64 --out run"
+    result = shell(f"ulimit -f 16; exec python -m arcade_torch.tools {words}", tmp_path)
+    said = result.stderr.decode().splitlines()[-1]
+    assert said.startswith("arcade-torch: could not write run/checkpoints/"), said
+    assert "File too large; there is no checkpoint yet: raise ulimit -f" in said
+    assert result.returncode == 1
+
+
 ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
 LOCALES: dict[str, Mapping[str, str]] = {
     "c": {"LC_ALL": "C"},
@@ -155,6 +167,23 @@ def test_make_says_in_one_line_that_jax_has_no_such_platform(program: str, tmp_p
     assert last.startswith(
         "ValueError: JAX_PLATFORMS is 'cuda', but JAX has no such device here"
     ), last
+
+
+@pytest.mark.parametrize(
+    ("environment", "reason"),
+    [
+        ({"JAX_ENABLE_X64": "abc"}, "invalid truth value 'abc' for environment 'JAX_ENABLE_X64'"),
+        ({"JAX_DEFAULT_PRNG_IMPL": "abc"}, 'Invalid value "abc" for JAX flag jax_default_prng_imp'),
+    ],
+)
+def test_a_setting_that_jax_refuses_is_one_line(
+    environment: dict[str, str], reason: str, tmp_path: Path
+) -> None:
+    words = "list sheet CartPoleEasy --steps 0"
+    result = shell(f"python -m arcade_torch.tools {words}", tmp_path, **environment)
+    said = result.stderr.decode()
+    assert result.returncode == 1 and said.count("\n") == 1, said
+    assert said.startswith(f"arcade-torch: JAX refuses a setting of this shell: {reason}"), said
 
 
 def test_play_names_the_stream_that_is_no_terminal(tmp_path: Path) -> None:

@@ -152,8 +152,8 @@ class StudyFolder:
         for run in before.runs():
             if run.name not in names:
                 raise FileExistsError(
-                    f"{self.root} holds run {run.name}, which this study lacks: choose another "
-                    "--out"
+                    f"{self.root} holds run {run.name}, which this study lacks"
+                    f"{_narrower(before, study) or ':'} choose another --out"
                 )
 
     def _new_record(self, study: Study, command: str, old: dict[str, Any]) -> dict[str, Any]:
@@ -224,6 +224,16 @@ class StudyFolder:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             return str(read_json(self.root / "failures" / f"{spec.name}.json")["error"])
         return ""
+
+
+def _narrower(before: Study, study: Study) -> str:
+    """Which axis of a study lost values, and how to have them again; empty if none did."""
+    for axis in ("games", "memories", "observability", "algorithms", "sizes"):
+        now = list(getattr(study, axis))
+        lost = [value for value in getattr(before, axis) if value not in now]
+        if lost:
+            return f" ({axis} = {now}, without {', '.join(lost)}): add it, or"
+    return ""
 
 
 def _check_finished(study: Study, runs: Mapping[RunSpec, Run]) -> None:
