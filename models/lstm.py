@@ -22,7 +22,9 @@ from arcade_torch.models.sequential import (
 
 __all__ = ["LSTM", "lstm_loop", "lstm_scan", "lstm_scan_backward"]
 
-STEPS_PER_START = 8  # with fewer, torch's LSTM, once between any two starts, is no faster
+STEPS_PER_CALL = 8
+ROWS_PER_CALL = 64
+"""Steps, and steps times batch: with less for each, calls of torch's LSTM are no faster."""
 OPTIONS = (True, 1, 0.0, True, False, True)
 """Of torch's LSTM: biases, one layer, no dropout, fit for a backward pass, one direction, batch
 first."""
@@ -66,7 +68,7 @@ class LSTM(Memory):
         self._check(x, state, is_init)
         h0 = state["h"]
         starts = later_starts(is_init) if _has_fused(x) else None
-        if starts is not None and len(starts) * STEPS_PER_START <= x.shape[1]:
+        if starts is not None and _are_few(starts, len(x), x.shape[1]):
             y, last = self._run_torchs(x, h0, is_init, starts)
         else:
             y, states = self.run(x, h0, is_init)
@@ -110,6 +112,12 @@ def _has_fused(x: Tensor) -> bool:
     if torch._C._are_functorch_transforms_active():
         return False
     return torch.backends.mkldnn.is_available() and bool(torch.backends.mkldnn.enabled)
+
+
+def _are_few(starts: list[int], batch: int, steps: int) -> bool:
+    """Whether torch's LSTM, called once between any two starts, is faster than our loop."""
+    calls = 1 + len(starts)
+    return calls * max(STEPS_PER_CALL * batch, ROWS_PER_CALL) <= batch * steps
 
 
 def lstm_loop(

@@ -54,11 +54,11 @@ def test_a_start_in_the_middle_is_torchs_lstm_begun_again() -> None:
 
 
 def few_starts(memory: nn.Module) -> list[torch.Tensor]:
-    """x, a state and flags of 40 steps: one start at index 0, three in the middle at two steps."""
+    """x, a state and flags of 80 steps: one start at index 0, three in the middle at two steps."""
     dtype = memory.like.dtype
-    x = torch.randn(3, 40, 4, dtype=dtype, requires_grad=True)
+    x = torch.randn(3, 80, 4, dtype=dtype, requires_grad=True)
     h = torch.randn(3, 2, 6, dtype=dtype, requires_grad=True)
-    is_init = torch.zeros(3, 40, dtype=torch.bool)
+    is_init = torch.zeros(3, 80, dtype=torch.bool)
     is_init[0, 0] = is_init[1, 7] = is_init[2, 7] = is_init[1, 33] = True
     return [x, h, is_init]
 
@@ -89,9 +89,9 @@ def test_few_starts_are_read_by_torchs_own_operator_values_and_gradients(calls: 
     memory = make_memory("lstm", 4, 6)
     x, h, is_init = few_starts(memory)
     ours = read(memory, x, h, is_init)
-    assert calls == [7, 26, 7]
+    assert calls == [7, 26, 47]
     y, states = memory.run(x, h, is_init)
-    assert calls == [7, 26, 7]
+    assert calls == [7, 26, 47]
     plain = [y, states[:, -1]]
     torch.testing.assert_close(ours, plain, rtol=1e-6, atol=1e-6)
     leaves = [x, h, *memory.parameters()]
@@ -118,11 +118,14 @@ def test_a_start_hides_what_was_before_from_torchs_operator_too() -> None:
     assert poisoned[2, 6].isnan().all()
 
 
-def test_many_starts_and_float64_are_read_by_the_loop(calls: list[int]) -> None:
+def test_many_starts_few_rows_and_float64_are_read_by_the_loop(calls: list[int]) -> None:
     memory = make_memory("lstm", 4, 6)
     x, h, is_init = few_starts(memory)
-    is_init[0, 10:15] = True
+    read(memory, x[:1, :60], h[:1], is_init[:1, :60])  # rows
+    is_init[0, 10] = True
     read(memory, x, h, is_init)
+    tenfold = [rows.repeat_interleave(10, 0) for rows in (x[:, :15], h, is_init[:, :15])]
+    read(memory, *tenfold)  # steps
     read(memory.double(), *few_starts(memory))
     assert calls == []
 
