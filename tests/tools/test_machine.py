@@ -4,10 +4,12 @@ import time
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 
 from arcade_torch.agents import preset, training
+from arcade_torch.agents.evaluation import EvalResult
 from arcade_torch.models import SmallEncoder
 from arcade_torch.tools import cli, exploring
 from arcade_torch.tools import machine as machine_module
@@ -60,7 +62,8 @@ def test_train_says_where_bfloat16_costs_time(
 ) -> None:
     """A Xeon without AMX takes a sixth longer, an EPYC without AMX half the time."""
     monkeypatch.setattr(machine_module, "bfloat16_time", lambda config: share)
-    stop = SimpleNamespace(evaluation=SimpleNamespace(mean=0.0, returns=[0.0]), run_dir=tmp_path)
+    evaluation = EvalResult(np.zeros(1, np.float32), np.ones(1, np.int64))
+    stop = SimpleNamespace(evaluation=evaluation, run_dir=tmp_path)
     monkeypatch.setattr(training, "train", lambda *arguments: stop)
     monkeypatch.setattr(exploring, "stopped_exploring", lambda run: None)
     out = str(tmp_path / "run")

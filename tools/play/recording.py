@@ -236,32 +236,30 @@ class EvaluationVideos:
         """Film an agent."""
         if self._failed:
             return
-        games = dict.fromkeys(games_of(agent.config.env))
-        for game in games:
-            which = f"-{game}" if len(games) > 1 else ""
-            self._film(agent, game, f"frames-{agent.frames:09d}{which}{self.suffix}")
-
-    def _film(self, agent: Any, game_id: str, name: str) -> None:
-        """Film one game of an agent."""
-        path = self.folder / name
+        name = f"frames-{agent.frames:09d}"
         try:
-            config = agent.config
-            partial = agent.config.observability != "full"
-            game = compiled_game(game_id, config.obs_size, config.rules, dict(config.env_options))
-            session = Session(
-                game,
-                seed=FILM_SEED,
-                partial=partial,
-                both=config.observability == "mixed",
-                episodes=1,
-            )
-            player = trained(agent, partial)
-            frames = recorded_frames(
-                session, player, max_steps=self.max_steps, hold=FILM_FPS, scale=2
-            )
-            self._write(path, frames, FILM_FPS)
+            games = dict.fromkeys(games_of(agent.config.env))
+            for game in games:
+                which = f"-{game}" if len(games) > 1 else ""
+                self._film(agent, game, self.folder / f"{name}{which}{self.suffix}")
         except Exception as error:  # a training is worth more than its film
             self._failed = True
             warnings.warn(
-                f"no more films, {path.name}: {type(error).__name__}: {error}", stacklevel=2
+                f"no more films, {name}{self.suffix}: {type(error).__name__}: {error}", stacklevel=2
             )
+
+    def _film(self, agent: Any, game_id: str, path: Path) -> None:
+        """Film one game of an agent."""
+        config = agent.config
+        partial = config.observability != "full"
+        game = compiled_game(game_id, config.obs_size, config.rules, dict(config.env_options))
+        session = Session(
+            game,
+            seed=FILM_SEED,
+            partial=partial,
+            both=config.observability == "mixed",
+            episodes=1,
+        )
+        player = trained(agent, partial)
+        frames = recorded_frames(session, player, max_steps=self.max_steps, hold=FILM_FPS, scale=2)
+        self._write(path, frames, FILM_FPS)
