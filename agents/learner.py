@@ -83,7 +83,7 @@ class Learner:
         self.training = training
         self.parameters = [p for p in loss.parameters() if p.requires_grad]
         self.optimizer = make_optimizer(self.parameters, config.learning_rate, optimizer)
-        # of PPO; in the checkpoint too
+        # PPO's running mean of advantages, which a checkpoint holds too; the others' is empty
         self.norm: nn.Module = getattr(loss, "advantage_norm", None) or nn.Module()
         self.frames_per_step = config.frames_per_update / config.grad_steps_per_update
         self.grad_steps = 0
@@ -128,26 +128,28 @@ class Learner:
             return {"lr": self.learning_rate}
         self.grad_steps += len(steps)
         names = list(steps[0].keys())
-        table = torch.stack(
-            [torch.stack([step[name] for name in names]) for step in steps]
-        ).tolist()
-        for number, row in enumerate(table):
-            for name, text in (("loss", "loss"), ("grad_norm", "gradient norm")):
-                value = row[names.index(name)]
+        table = torch.stack([torch.stack([step[name] for name in names]) for step in steps])
+        columns = dict(zip(names, table.T.tolist(), strict=True))
+        self._check_finite(columns)
+        means = {name: sum(column) / len(column) for name, column in columns.items()}
+        return means | {"lr": self.learning_rate}
+
+    def _check_finite(self, columns: dict[str, list[float]]) -> None:
+        """Raise NonFiniteError for the first step with a loss or a gradient that is not finite, or
+        for weights that are not.
+        """
+        losses = columns["loss"]
+        for number, (loss, norm) in enumerate(zip(losses, columns["grad_norm"], strict=True)):
+            for text, value in (("loss", loss), ("gradient norm", norm)):
                 if not math.isfinite(value):
                     raise NonFiniteError(
-                        f"the {text} is {value} at gradient step {number + 1} of {len(table)}"
+                        f"the {text} is {value} at gradient step {number + 1} of {len(losses)}"
                     )
-        if not bool(torch.stack([p.detach().sum() for p in self.parameters]).isfinite().all()):
-            bad = [
-                n for n, p in self.loss.named_parameters() if not bool(p.detach().isfinite().all())
-            ]
-            raise NonFiniteError(f"the weights {', '.join(bad[:3])} are not finite")
-        means = {
-            name: sum(column) / len(table)
-            for name, column in zip(names, zip(*table, strict=True), strict=True)
-        }
-        return means | {"lr": self.learning_rate}
+        sums = torch.stack([p.detach().sum() for p in self.parameters])
+        if bool(sums.isfinite().all()):
+            return
+        bad = [n for n, p in self.loss.named_parameters() if not bool(p.detach().isfinite().all())]
+        raise NonFiniteError(f"the weights {', '.join(bad[:3])} are not finite")
 
     def state_dict(self) -> dict[str, Any]:
         """Everything but the trained weights and the generator that the coming updates depend

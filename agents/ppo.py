@@ -416,10 +416,9 @@ class PPO(Learner):
         if self.loss.advantage_norm is not None:
             self.loss.advantage_norm.update(data["advantage"])
         for minibatch in self.minibatches(data):
-            left = self.config.entropy_coeff * self.config.entropy_end ** (
-                frames / self.training.total_frames
-            )
-            self.loss.entropy_coeff.fill_(left)
+            progress = frames / self.training.total_frames
+            share_left = self.config.entropy_end**progress
+            self.loss.entropy_coeff.fill_(self.config.entropy_coeff * share_left)
             self.gradient_step(minibatch, frames)
             frames += self.frames_per_step
         metrics = self.take_metrics()

@@ -404,8 +404,8 @@ class ArcadeCollector(BaseCollector):
                 "is loaded: take it before"
             )
         out: OrderedDict[str, Any] = OrderedDict(frames=self._frames, iter=self._iter)
-        # by others: see _look
         out["acted"] = self._acted
+        # by somebody else since the last window: see _look
         out["moved"] = self.env.generation[0] != self._seen[0]
         out["sizes"] = [self._num_envs, self._steps, self._overlap]
         out["generator"] = self._generator.get_state()

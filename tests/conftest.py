@@ -23,6 +23,9 @@ os.environ.setdefault(
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
+# Programs that tests start say their words as a user's do: into a log in blocks, unless they flush.
+os.environ.pop("PYTHONUNBUFFERED", None)
+
 # What tests import is no choice of the user who runs them.
 os.environ["XDG_STATE_HOME"] = str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "state")
 

@@ -39,8 +39,8 @@ def _written_out(char: str) -> str:
 
 
 def say(text: object) -> None:
-    """Print one line to stdout."""
-    print(printable(text))
+    """Print one line to stdout, at once: in a log it stands before what stderr says later."""
+    print(printable(text), flush=True)
 
 
 def warn(text: object) -> None:

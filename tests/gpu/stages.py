@@ -252,6 +252,9 @@ def launch(stage: Stage, log: Path, seconds: float) -> int | None:
         filter(None, (str(ROOT), os.environ.get("PYTHONPATH")))
     )
     environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(log.parent.resolve() / "cache"))
+    environment["PYTHONUNBUFFERED"] = (
+        "1"  # the log has every word in its place, also of a killed one
+    )
     command = [sys.executable, *stage.argv]
     with log.open("w") as file:
         process = subprocess.Popen(

@@ -46,6 +46,7 @@ class Processes:
         """
         waiting = list(jobs)
         environment = os.environ | _ONE_THREAD | {PARENT_VARIABLE: str(os.getpid())}
+        environment["PYTHONUNBUFFERED"] = "1"  # the last words in a log are why a run failed
         places = self._places(len(waiting))
         workers = [Worker(self.program, environment, cores) for cores in places]
         try:
