@@ -7,7 +7,7 @@ import pytest
 from arcade_torch.tools import cli
 from arcade_torch.tools.exploring import stopped_exploring
 from arcade_torch.tools.measures.gap_bias.measure import normalise
-from arcade_torch.tools.names import game_names
+from arcade_torch.tools.names import bare_name, game_names
 from arcade_torch.tools.runs import Run
 
 MIXTURE = "CartPoleEasy+SkittlesEasy"
@@ -70,9 +70,12 @@ def test_returns_of_a_mixture_have_no_common_scale() -> None:
         normalise("BattleShipEasy-v0+CartPoleEasy-v0", 0.5)
 
 
-def test_a_mixture_keeps_its_name() -> None:
+def test_a_mixture_has_one_name_with_versions_and_without() -> None:
     pinned = "CartPoleEasy-v0+2*SkittlesEasy-v0"
-    assert game_names([pinned, "TetrisEasy"])[pinned] == pinned
+    bare = "CartPoleEasy+2*SkittlesEasy"
+    assert bare_name(pinned) == bare_name(bare) == bare
+    names = game_names([pinned, bare, "CartPoleEasy-v0"])
+    assert names[pinned] == names[bare] != names["CartPoleEasy-v0"]
 
 
 def test_a_mixture_that_stopped_exploring_is_told(tmp_path: Path) -> None:
