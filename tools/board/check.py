@@ -3,7 +3,7 @@
 import datetime
 import hashlib
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -76,7 +76,8 @@ def check(
 
     Scores have to be equal to the bit where commit, versions and processor are those of the entry.
     Elsewhere a score may differ by half the 95 % interval of its mean as it is evaluated here, or
-    by `LEAST_TOLERANCE`, whichever is more.
+    by `LEAST_TOLERANCE`, whichever is more. Runs that were trained again elsewhere have other
+    weights: their scores are compared, which decides nothing.
 
     Args:
         file: of the entry; read as a stranger's.
@@ -102,7 +103,10 @@ def check(
         get_missing = {"pulled": pull, "retrained": retrain}[weights]
         get_missing(entry, chosen, runs, progress)
     folders = find_folders(entry, chosen, runs)
-    results, equal = _play_again(entry, chosen, folders, protocol, progress)
+    is_same = _is_same_machine(entry.made_with, made_with())
+    if weights == "retrained" and not is_same:
+        _compare_other_weights(entry, chosen, folders, protocol, progress)
+    results, equal = _play_again(entry, chosen, folders, protocol, is_same, progress)
     if len(results) == len(entry.runs):
         _check_largest(entry, results)
     pairs = zip(results, chosen, strict=True)
@@ -163,12 +167,12 @@ def _play_again(
     chosen: Sequence[BoardRun],
     folders: dict[tuple[str, str, int], Path],
     protocol: Protocol,
+    is_same: bool,
     progress: Progress | None,
 ) -> tuple[list[Played], int]:
     """What the runs play now, and how many scores are equal to the bit; refuses what does not
     agree.
     """
-    is_same = _is_same_machine(entry.made_with, made_with())
     evaluator = Evaluator(protocol)
     results = list[Played]()
     equal = 0
@@ -183,6 +187,45 @@ def _play_again(
     return results, equal
 
 
+def _compare_other_weights(
+    entry: Entry,
+    chosen: Sequence[BoardRun],
+    folders: dict[tuple[str, str, int], Path],
+    protocol: Protocol,
+    progress: Progress | None,
+) -> None:
+    """Play runs that were trained at another commit or on another processor than the entry's and
+    have other weights than its; if there are any, refuse the check and say how far the scores are
+    apart.
+    """
+    evaluator = Evaluator(protocol)
+    differences = list[float]()
+    for done, run in enumerate(chosen, 1):
+        checkpoint = folders[run.cell] / "checkpoints" / checkpoint_name(entry.frames)
+        if _hash_of(run, checkpoint) == run.weights_sha256:
+            continue
+        differences.append(abs(evaluator.play(checkpoint, run.twin).score - run.score))
+        if progress is not None:
+            progress(f"compared {run.name}", done, len(chosen))
+    if not differences:
+        return
+    raise EntryRefusedError(
+        f"trained again here, {len(differences)} of {len(chosen)} runs have other weights than "
+        f"the entry's: it was made by {_made_by(entry.made_with)}, this is "
+        f"{_made_by(made_with())}, and a training is the same to the bit only where all of that "
+        f"is. Their scores differ by {sum(differences) / len(differences):.4f} on average, at most "
+        f"by {max(differences):.4f}. That neither confirms nor refutes the entry: ask for its "
+        "checkpoints, or train it where it was trained"
+    )
+
+
+def _made_by(about: Mapping[str, Any]) -> str:
+    """Commit, processor and version of torch of something, in words."""
+    commit = about.get("commit") or "unknown"
+    processor = about.get("processor") or "an unknown processor"
+    return f"commit {commit} on {processor} with torch {about.get('torch', 'unknown')}"
+
+
 def _config_of(folder: Path) -> TrainConfig | None:
     """The settings of a run folder; None of one that is damaged."""
     try:
@@ -191,12 +234,17 @@ def _config_of(folder: Path) -> TrainConfig | None:
         return None
 
 
-def _check_weights(run: BoardRun, checkpoint: Path) -> None:
-    """Refuse weights that are not those of the entry, before anything is loaded."""
+def _hash_of(run: BoardRun, checkpoint: Path) -> str:
+    """SHA-256 of the weights of a run; refuses a checkpoint without weights."""
     try:
-        sha256 = weights_hash(checkpoint)
+        return weights_hash(checkpoint)
     except FileNotFoundError:
         raise EntryRefusedError(f"checkpoint of {run.name}: {checkpoint} has no weights") from None
+
+
+def _check_weights(run: BoardRun, checkpoint: Path) -> None:
+    """Refuse weights that are not those of the entry, before anything is loaded."""
+    sha256 = _hash_of(run, checkpoint)
     if sha256 != run.weights_sha256:
         raise EntryRefusedError(
             f"checkpoint of {run.name}: the weights below {checkpoint} have SHA-256 "

@@ -78,8 +78,9 @@ class Check(Command):
     runs: Path | None = None  # Folder with its run folders somewhere below.
     cells: int = 0  # Evaluate so many runs, drawn at random; 0 for all.
     retrain: bool = False
-    """Train the runs that are not below --runs first, from the settings in the entry: a run gives
-    the same weights again on the same processor and versions.
+    """Train the runs that are not below --runs first, from the settings in the entry. A run gives
+    the same weights again at the same commit, on the same processor and versions; elsewhere its
+    score is compared, which decides nothing (exit code 2).
     """
     pull: bool = False
     """Fetch the runs that are not below --runs first, from the hub that the entry names (extra

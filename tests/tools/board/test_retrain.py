@@ -28,3 +28,35 @@ def test_a_run_that_is_trained_again_from_its_entry_has_the_same_weights_and_sco
     monkeypatch.setattr(checks, "MOST_FRAMES_AGAIN", 100)
     with pytest.raises(EntryRefusedError, match="are not trained again, at most 100"):
         check(file, tmp_path / "third", protocol=SHORT, weights="retrained")
+
+
+def test_a_run_that_is_trained_elsewhere_is_compared_by_its_score_and_decides_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for twin in ("full", "partial"):
+        config = preset("smoke", env="CartPoleEasy-v0", observability=twin, seed=3, threads=1)
+        train(config, tmp_path / "runs" / twin)
+    plain = plain_entry(tmp_path / "runs")
+    plain["made_with"] |= {"commit": "0123456789ab", "processor": "another one"}
+    for run in plain["runs"]:
+        run["weights_sha256"] = "0" * 64
+    plain["runs"][1]["score"] += 0.25
+    file = tmp_path / "entry.json"
+    file.write_text(json.dumps(plain))
+    says = (
+        r"^trained again here, 2 of 2 runs have other weights .* commit 0123456789ab on another one"
+        r".* differ by 0.1250 on average, at most by 0.2500.* neither confirms nor refutes"
+    )
+    with pytest.raises(EntryRefusedError, match=says):
+        check(file, tmp_path / "runs", protocol=SHORT, weights="retrained")
+    # whoever gives checkpoints gives those of the entry
+    others = r"^checkpoint of .* the entry says 0000000000000000"
+    with pytest.raises(EntryRefusedError, match=others):
+        check(file, tmp_path / "runs", protocol=SHORT, weights="kept")
+
+    now = checks.made_with() | {"commit": "0123456789ab"}
+    monkeypatch.setattr(checks, "made_with", lambda: now)
+    plain["made_with"] = now
+    file.write_text(json.dumps(plain))
+    with pytest.raises(EntryRefusedError, match=others):
+        check(file, tmp_path / "runs", protocol=SHORT, weights="retrained")
