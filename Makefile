@@ -46,7 +46,7 @@ help:
 	@echo "make test-oldest  a part of the tests with the oldest supported versions, in $(OLDEST)"
 	@echo "make test-newest  the contracts, the bridge, the losses and a run with the newest versions there are, in $(NEWEST)"
 	@echo "                (NEWEST_TORCHRL=torchrl: its newest release in the place of its nightly build)"
-	@echo "make test-suites  from_jax on gymnax and Craftax, memories of ncps, mambapy and minGRU-pytorch, in $(SUITES)"
+	@echo "make test-suites  from_jax on gymnax and Craftax, memories of ncps, mambapy and minGRU-pytorch, scans of fla-core, in $(SUITES)"
 	@echo "make lint       ruff and mypy"
 	@echo "make bench      every benchmark into results/bench.json and results/bench.md, about ten minutes"
 	@echo "make gpu        what needs a GPU, eight minutes a call; goes on when called again (OUT=folder for CSV and logs)"
@@ -92,6 +92,8 @@ test-suites: $(SUITES)/.installed
 	$(ONE_THREAD) JAX_COMPILATION_CACHE_DIR=$(SUITES)/jax-cache SUITES_ARE_THERE=1 \
 	  $(SUITES)/bin/python -m pytest --timeout=3600 -k "not popgym" \
 	  tests/contracts/test_jax_suites.py tests/contracts/test_memories_of_others.py $(ARGS)
+	SUITES_ARE_THERE=1 $(ONE_THREAD) $(SUITES)/bin/python -m pytest \
+	  tests/models -k flash_linear_attention
 
 $(VENV)/.parity: $(VENV)/.installed
 	$(PIP) --no-build-isolation -e '.[parity]'

@@ -1,6 +1,7 @@
 """For the tests that write a memory's equations out, one step after the other."""
 
 import importlib.util
+import os
 from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType
@@ -66,10 +67,12 @@ def pinned_pass(name: str, **options: object) -> Tensor:
 
 def file_of(package: str, path: str) -> ModuleType:
     """A file of a package that is installed, on its own: what stands around it needs more than is
-    here, as Triton for flash-linear-attention (``fla-core``). The test is skipped without it.
+    here, as Triton for flash-linear-attention (``fla-core``). The test is skipped without it, but
+    in `make test-suites`, which installs it.
     """
     found = importlib.util.find_spec(package)
     if found is None or not found.submodule_search_locations:
+        assert "SUITES_ARE_THERE" not in os.environ, f"the package of {package} is not installed"
         pytest.skip(f"the package of {package} is not installed")
     file = Path(next(iter(found.submodule_search_locations))) / path
     spec = importlib.util.spec_from_file_location(f"file_of_{package}", file)
