@@ -12,13 +12,12 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 _MODULES = {
-    "acting": ("make_actor",),
     "config": ("DQNConfig", "PPOConfig", "PQNConfig", "TrainConfig"),
     "dqn": ("DQN", "DQNLoss"),
     "evaluation": ("EvalResult", "evaluate", "held_out_seed"),
     "learner": ("NonFiniteError",),
     "metrics": ("paper_score",),
-    "policy": ("Agent", "build_network", "load", "make_policy"),
+    "policy": ("Agent", "build_network", "load", "make_actor", "make_policy"),
     "ppo": ("PPO", "PPOLoss"),
     "pqn": ("PQN", "PQNLoss"),
     "pretrained": ("from_pretrained",),
@@ -35,13 +34,12 @@ _MODULES = {
 _PUBLIC = {name: module for module, names in _MODULES.items() for name in names}
 
 if TYPE_CHECKING:
-    from arcade_torch.agents.acting import make_actor
     from arcade_torch.agents.config import DQNConfig, PPOConfig, PQNConfig, TrainConfig
     from arcade_torch.agents.dqn import DQN, DQNLoss
     from arcade_torch.agents.evaluation import EvalResult, evaluate, held_out_seed
     from arcade_torch.agents.learner import NonFiniteError
     from arcade_torch.agents.metrics import paper_score
-    from arcade_torch.agents.policy import Agent, build_network, load, make_policy
+    from arcade_torch.agents.policy import Agent, build_network, load, make_actor, make_policy
     from arcade_torch.agents.ppo import PPO, PPOLoss
     from arcade_torch.agents.pqn import PQN, PQNLoss
     from arcade_torch.agents.presets import preset, preset_names

@@ -12,7 +12,7 @@ from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import MOST_EPISODES, SEED_LIMIT, TrainConfig
 from arcade_torch.agents.metrics import student_half_width
 from arcade_torch.agents.torch_settings import plain_torch
-from arcade_torch.envs_jax.checks import check_ends
+from arcade_torch.envs_jax.game import check_ends
 from arcade_torch.envs_jax.registry import is_mixture, resolve_id
 
 

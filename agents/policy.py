@@ -12,11 +12,11 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, TensorDictSequential
 from torch import Tensor, nn
+from torch.distributions import Categorical as CategoricalDistribution
 from torchrl.data import Categorical, Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
-from torchrl.modules import EGreedyModule, QValueModule
+from torchrl.modules import EGreedyModule, ProbabilisticActor, QValueModule
 
-from arcade_torch.agents.acting import make_actor
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.forward import evaluating, last_outputs
@@ -63,6 +63,43 @@ def make_policy(
     host = torch.device("cpu")  # made there whatever torch's default device is, and then moved
     exploring = EpsilonGreedy(actions, eps_init=float(epsilon), eps_end=0.0, device=host)
     return TensorDictSequential(network, greedy, exploring.to(device))
+
+
+def make_actor(network: TensorDictModuleBase, deterministic: bool = False) -> ProbabilisticActor:
+    """A policy that samples from the softmax of ``logits``.
+
+    Args:
+        network: any TensorDict module that writes ``logits`` [*, A].
+        deterministic: take the most likely action unless told otherwise (``set_exploration_type``).
+
+    Returns:
+        TorchRL's ``ProbabilisticActor``; writes ``action`` int64 [*] and ``action_log_prob``.
+    """
+    return ProbabilisticActor(
+        network,
+        in_keys=["logits"],
+        distribution_class=Choice,
+        distribution_kwargs={"validate_args": False},
+        return_log_prob=True,
+        default_interaction_type=ExplorationType.DETERMINISTIC
+        if deterministic
+        else ExplorationType.RANDOM,
+    )
+
+
+class Choice(CategoricalDistribution):
+    """A categorical distribution that samples something even where logits are NaN.
+
+    ``torch.multinomial`` stops the process there (on CUDA for good), before the learner can name
+    the update.
+    """
+
+    deterministic_sample = CategoricalDistribution.mode  # the name that TorchRL asks for
+
+    def sample(self, sample_shape: Any = ()) -> Tensor:
+        """Draw by the largest of ``logits + Gumbel noise``, int64 [*sample_shape, *batch]."""
+        logits = self.logits.expand(*sample_shape, *self.logits.shape)
+        return (logits - torch.empty_like(logits).exponential_().log()).argmax(-1)
 
 
 class EpsilonGreedy(EGreedyModule):

@@ -18,7 +18,6 @@ from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 
-from arcade_torch.agents.acting import make_actor
 from arcade_torch.agents.batch_checks import (
     Key,
     entry,
@@ -32,6 +31,7 @@ from arcade_torch.agents.config import PPOConfig, TimeLimit
 from arcade_torch.agents.layout import NetworkInputs, as_steps, written
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.network_loss import NetworkLoss
+from arcade_torch.agents.policy import make_actor
 from arcade_torch.agents.returns import SequenceGAE
 
 

@@ -37,7 +37,7 @@ from arcade_torch.agents.runs.folder import METRIC_COLUMNS
 from arcade_torch.agents.runs.states import check_state
 from arcade_torch.agents.torch_settings import plain_torch
 from arcade_torch.devices import pick_devices
-from arcade_torch.envs_jax.checks import check_ends
+from arcade_torch.envs_jax.game import check_ends
 from arcade_torch.envs_jax.registry import is_built_in
 
 LEARNERS: dict[str, Callable[..., PQN | PPO | DQN]] = {"pqn": PQN, "ppo": PPO, "dqn": DQN}

@@ -13,10 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from arcade_torch.envs_jax import Game, MixedGames
-from arcade_torch.envs_jax import make as make_game
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, Outcome, choose_rows
+from arcade_torch.envs_jax.game import Game
+from arcade_torch.envs_jax.mixture import MixedGames
 from arcade_torch.envs_jax.registry import games_of
+from arcade_torch.envs_jax.registry import make as make_game
 from arcade_torch.envs_jax.settings import compiled
 from arcade_torch.envs_jax.validation import format_value, plain
 from arcade_torch.frame_memory import Canvas, Spare

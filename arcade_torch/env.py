@@ -23,12 +23,17 @@ from arcade_torch.compiled import (
 )
 from arcade_torch.devices import pick_devices, wait_for_torch
 from arcade_torch.dlpack import int32_argument, is_host, to_torch
-from arcade_torch.envs_jax import Game, MixedGames, Mixture
 from arcade_torch.envs_jax.batch import Batch, choose_rows, env_keys
-from arcade_torch.envs_jax.validation import check_fits, check_num_envs
+from arcade_torch.envs_jax.game import Game
+from arcade_torch.envs_jax.mixture import MixedGames, Mixture
+from arcade_torch.envs_jax.validation import (
+    Observability,
+    check_fits,
+    check_num_envs,
+    partial_flags,
+)
 from arcade_torch.final_observations import FinalObservations
 from arcade_torch.frame_memory import FrameMemory
-from arcade_torch.observability import Observability, partial_flags
 from arcade_torch.process import check_process
 from arcade_torch.raw_step import Place, RawStep
 from arcade_torch.snapshot import Snapshots

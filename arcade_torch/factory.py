@@ -9,8 +9,7 @@ from arcade_torch import default_seeds
 from arcade_torch.compiled import compiled_game
 from arcade_torch.default_seeds import DEFAULT_SEED
 from arcade_torch.env import ArcadeEnv
-from arcade_torch.envs_jax.validation import check_num_envs
-from arcade_torch.observability import Observability, partial_flags
+from arcade_torch.envs_jax.validation import Observability, check_num_envs, partial_flags
 
 
 def make(

@@ -176,17 +176,6 @@ def _check_numbers(game: Game[Any], state: Any, reward: Any, step: int) -> None:
             raise ValueError(f"{game.id}: step {step} gives state entry {name} as nan")
 
 
-def check_ends(game: Any, steps: int) -> None:
-    """Raise ValueError if an episode still runs after so many steps: one more than ``max_steps``,
-    for by the reference rules some games end a step late.
-    """
-    if steps > game.max_steps:
-        raise ValueError(
-            f"{game.id}: an episode runs on after {steps} steps, and max_steps is "
-            f"{game.max_steps}: step has to give truncated there"
-        )
-
-
 def check_made(game: Any, full_id: str, obs_size: int) -> None:
     """Refuse what a factory made if it is not the game that was asked for, or does not keep the
     contract.

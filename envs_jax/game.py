@@ -329,3 +329,14 @@ class LevelGame(Game[State]):
     def render(self, state: State, partial: Array | bool) -> Array:
         """See :meth:`Game.render`."""
         return self.screen.draw(state, partial)
+
+
+def check_ends(game: Any, steps: int) -> None:
+    """Raise ValueError if an episode still runs after so many steps: one more than ``max_steps``,
+    for by the reference rules some games end a step late.
+    """
+    if steps > game.max_steps:
+        raise ValueError(
+            f"{game.id}: an episode runs on after {steps} steps, and max_steps is "
+            f"{game.max_steps}: step has to give truncated there"
+        )

@@ -16,8 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, env_keys
-from arcade_torch.envs_jax.checks import check_ends
-from arcade_torch.envs_jax.game import NUM_ACTIONS, ORACLES, Game
+from arcade_torch.envs_jax.game import NUM_ACTIONS, ORACLES, Game, check_ends
 from arcade_torch.envs_jax.settings import as_numpy
 from arcade_torch.envs_jax.validation import check_choice, format_value
 

@@ -1,7 +1,10 @@
 """What a refusal says: the value that arrived, on one line, and what is allowed."""
 
 import os
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
 
 _LONGEST = 200
 
@@ -86,3 +89,53 @@ def check_fits(num_envs: int, obs_size: int) -> None:
             f"num_envs is {num_envs}: the frames of one step take {frames / 1e9:.0f} GB, "
             f"this machine has {memory / 1e9:.0f}: take at most {memory * num_envs // frames // 4}"
         )
+
+
+Observability = Literal["full", "partial"] | npt.ArrayLike  # a tensor is array-like too
+_ALLOWED = "allowed: 'full', 'partial', or bools, one an env (True = partial)"
+
+
+def partial_flags(
+    observability: Observability | None, num_envs: int, partial_obs: bool | None = None
+) -> npt.NDArray[np.bool_]:
+    """Which envs show the Markov state (MDP) and which the partial view (POMDP): one flag an env.
+
+    Args:
+        observability: ``"full"``, ``"partial"``, or bool [num_envs], array or tensor; None if not
+            given.
+        num_envs: Number of envs.
+        partial_obs: The alias: true means ``"partial"``; None if not given.
+
+    Returns:
+        bool [num_envs], true where the env shows its POMDP twin. False everywhere if neither is
+        given. A new array.
+
+    Raises:
+        ValueError: Both are given, or another word, type or shape.
+        TypeError: ``partial_obs`` is no bool.
+    """
+    partial_obs = plain(partial_obs)
+    if partial_obs is not None:
+        if observability is not None:
+            raise ValueError(
+                "observability and partial_obs are given: keep observability, partial_obs is its "
+                "alias"
+            )
+        if not isinstance(partial_obs, bool):
+            raise TypeError(f"partial_obs is {format_value(partial_obs)}, allowed: True, False")
+        return np.full(num_envs, partial_obs)
+    if observability is None or isinstance(observability, str):
+        if observability not in (None, "full", "partial"):
+            raise ValueError(f"observability is {format_value(observability)}, {_ALLOWED}")
+        return np.full(num_envs, observability == "partial")
+    try:
+        flags = np.array(
+            observability.cpu().numpy() if hasattr(observability, "cpu") else observability
+        )
+    except ValueError:  # rows of different lengths
+        flags = np.array(None)
+    if flags.dtype != np.bool_ or flags.shape != (num_envs,):
+        raise ValueError(
+            f"observability is {flags.dtype} {flags.shape}, expected bool ({num_envs},): {_ALLOWED}"
+        )
+    return flags

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.compiled import CompiledGame
-from arcade_torch.envs_jax import Game
 from arcade_torch.envs_jax.batch import Batch, Outcome, env_keys
+from arcade_torch.envs_jax.game import Game
 from arcade_torch.envs_jax.settings import as_numpy, is_key
 from arcade_torch.final_observations import FinalObservations
 from arcade_torch.frame_memory import FrameMemory

@@ -9,10 +9,10 @@ from gymnasium.error import ResetNeeded
 
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax.batch import env_keys
+from arcade_torch.envs_jax.validation import Observability, partial_flags
 from arcade_torch.gym.batch import Frames, Info, NumpyBatch
 from arcade_torch.gym.copies import Copyable
 from arcade_torch.gym.window import Window
-from arcade_torch.observability import Observability, partial_flags
 
 RENDER_FPS = 30
 _WINDOW_SIDE_PIXELS = 512

@@ -13,11 +13,16 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from arcade_torch.compiled import compiled_game
-from arcade_torch.envs_jax.validation import check_choice, check_fits, check_num_envs
+from arcade_torch.envs_jax.validation import (
+    Observability,
+    check_choice,
+    check_fits,
+    check_num_envs,
+    partial_flags,
+)
 from arcade_torch.gym.batch import Bools, Frames, Info, NumpyBatch, seed_keys
 from arcade_torch.gym.copies import Copyable
 from arcade_torch.gym.env import RENDER_FPS, action_space, check_reset_options, observation_space
-from arcade_torch.observability import Observability, partial_flags
 
 Rewards = npt.NDArray[np.float64]
 StepResult = tuple[Frames, Rewards, Bools, Bools, Info]

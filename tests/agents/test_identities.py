@@ -20,8 +20,8 @@ from torchrl.objectives.value.functional import (
 )
 
 from arcade_torch.agents import gae, q_lambda_return
-from arcade_torch.agents.acting import make_actor
 from arcade_torch.agents.dqn import DQNLoss
+from arcade_torch.agents.policy import make_actor
 from arcade_torch.agents.ppo import PPOLoss
 from arcade_torch.agents.pqn import PQNLoss
 from tests.contracts.pomdp import ENVS, HIDDEN, STEPS, Eye, collected, explorer, network

@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.modules import EGreedyModule, GRUModule, QValueModule
 
-from arcade_torch.agents.acting import make_actor
+from arcade_torch.agents.policy import make_actor
 from arcade_torch.collector import ArcadeCollector
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.env import ArcadeEnv

@@ -33,8 +33,8 @@ from torchrl.objectives import (
 from torchrl.objectives import DQNLoss as TorchRLDQNLoss
 from torchrl.objectives.value import GAE
 
-from arcade_torch.agents.acting import make_actor
 from arcade_torch.agents.dqn import DQNLoss
+from arcade_torch.agents.policy import make_actor
 from arcade_torch.agents.ppo import PPOLoss
 from arcade_torch.agents.pqn import PQNLoss
 from arcade_torch.models import memory_names
