@@ -373,7 +373,7 @@ def _fitting(action: Tensor, policy: Distribution) -> Tensor:
 
 def _parts(actor: ProbabilisticTensorDictSequential) -> list[nn.Module]:
     """The modules of an actor in their order; the last one draws actions."""
-    modules = actor.module
+    modules: Any = actor.module
     return list(modules.values() if isinstance(modules, nn.ModuleDict) else modules)
 
 
@@ -381,9 +381,10 @@ def _may_write_value(actor: ProbabilisticTensorDictSequential, name: Key) -> boo
     """Whether an actor network writes the value, or something that ``set_keys`` may call so: an
     entry that the distribution does not read, and that is no state.
     """
-    *before, head = _parts(actor)
+    parts = _parts(actor)
+    head: Any = parts[-1]
     used = {*head.in_keys, *head.out_keys}
-    for key in TensorDictSequential(*before).out_keys:
+    for key in TensorDictSequential(*parts[:-1]).out_keys:
         if key == name or (key not in used and unravel_key(key)[0] != "next"):
             return True
     return False
