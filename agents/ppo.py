@@ -12,7 +12,7 @@ from tensordict.nn import (
     TensorDictSequential,
     dispatch,
 )
-from torch import Tensor
+from torch import Tensor, nn
 from torch.distributions import Distribution
 from torchrl.modules import PopArtValueNorm
 from torchrl.objectives import ValueEstimators
@@ -244,7 +244,7 @@ class PPOLoss(NetworkLoss):
         if value_type is None:
             critic = self.critic_network
             if critic is None:
-                critic = self.actor_network.det_part  # without its last part, which draws actions
+                critic = TensorDictSequential(*_parts(self.actor_network)[:-1])
             hyperparams.setdefault("critic", critic)
             hyperparams.setdefault("time_limit", self.time_limit)
             self._value_estimator = SequenceGAE(**hyperparams)
@@ -371,13 +371,20 @@ def _fitting(action: Tensor, policy: Distribution) -> Tensor:
     return action.squeeze(-1) if has_one_more else action
 
 
+def _parts(actor: ProbabilisticTensorDictSequential) -> list[nn.Module]:
+    """The modules of an actor in their order; the last one draws actions."""
+    modules: Any = actor.module
+    return list(modules.values() if isinstance(modules, nn.ModuleDict) else modules)
+
+
 def _may_write_value(actor: ProbabilisticTensorDictSequential, name: Key) -> bool:
     """Whether an actor network writes the value, or something that ``set_keys`` may call so: an
     entry that the distribution does not read, and that is no state.
     """
-    head = actor[-1]
+    parts = _parts(actor)
+    head: Any = parts[-1]
     used = {*head.in_keys, *head.out_keys}
-    for key in actor.det_part.out_keys:
+    for key in TensorDictSequential(*parts[:-1]).out_keys:
         if key == name or (key not in used and unravel_key(key)[0] != "next"):
             return True
     return False

@@ -108,7 +108,12 @@ class Suite:
             if is_key(leaf) or leaf.dtype.kind not in "biuf":  # V: bfloat16, int4, ...; c: complex
                 raise TypeError(
                     f"{name}: reset shows {place} as {leaf.dtype}, which torch does not share: "
-                    "give float32, or jax.random.key_data of a key"
+                    "give float32"
+                )
+            if leaf.dtype.kind == "u" and leaf.dtype.itemsize > 1:
+                raise TypeError(
+                    f"{name}: reset shows {place} as {leaf.dtype}, of which tensordict clones "
+                    "nothing, so that SerialEnv fails: give int32 or float32"
                 )
         check_same(name, "state", state, after)
 

@@ -1,12 +1,15 @@
 """The PPO loss against one written from a step-by-step play, number by number."""
 
 import math
+import sys
+from collections import OrderedDict
 from dataclasses import replace
 from functools import partial
 
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import ProbabilisticTensorDictSequential
 from torch import nn
 from torchrl.modules import PopArtValueNorm, set_recurrent_mode
 from torchrl.objectives import A2CLoss, ClipPPOLoss, LossModule
@@ -495,3 +498,31 @@ def test_a_gradient_step_of_ppo_never_waits_for_the_device():
         total(loss(batch)).backward()
     names = {event.key for event in profiler.key_averages()}
     assert "aten::exp" in names and "aten::_local_scalar_dense" not in names
+
+
+@pytest.mark.parametrize("named", [False, True], ids=["listed", "named"])
+def test_an_actor_of_whatever_parts_gives_the_value_without_what_tensordict_gives_up(
+    named, monkeypatch
+):
+    """``det_part`` warns from tensordict 0.15 on, and goes with 0.17."""
+
+    def for_tensordict_alone(actor):
+        assert sys._getframe(1).f_globals["__name__"].startswith("tensordict.")
+        return actor._det_part
+
+    gone = property(for_tensordict_alone)
+    monkeypatch.setattr(ProbabilisticTensorDictSequential, "det_part", gone)
+    s = with_two_states(stream(2, 5, seed=1))
+    network, batch, _ = acted(s)
+    parts = make_actor(network)
+    if named:
+        names = OrderedDict(zip(("network", "draw"), parts, strict=True))
+        parts = ProbabilisticTensorDictSequential(names)
+    loss = PPOLoss(parts)
+    loss.make_value_estimator(gamma=GAMMA, lmbda=LAM)
+    expected = PPOLoss(make_actor(network), network.critic)
+    expected.make_value_estimator(gamma=GAMMA, lmbda=LAM)
+    ours, theirs = loss.value_estimator(batch.copy()), expected.value_estimator(batch.copy())
+    for key in ESTIMATES:
+        torch.testing.assert_close(ours[key], theirs[key])
+    total(loss(ours)).backward()

@@ -207,7 +207,7 @@ def actor_with_critic(kind: str) -> Any:
     if kind == "beside":
         critic = ValueOperator(nn.Linear(4, 1), in_keys=["observation"])
         return TensorDictSequential(critic, actor)
-    encode, memory, logits = actor.det_part[0]
+    encode, memory, logits = actor[0]
     critic = ValueOperator(nn.Linear(16, 1), in_keys=["remembered"])
     head = ProbabilisticActor(
         logits,

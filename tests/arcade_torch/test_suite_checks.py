@@ -139,6 +139,10 @@ WRONG = {
         env_that_shows(jnp.zeros(2, jnp.complex64)),
         "Own: reset shows observation as complex64, which torch does not share: give float32",
     ),
+    "integers that tensordict does not clone": (
+        env_that_shows(jnp.zeros(2, jnp.uint32)),
+        "Own: reset shows observation as uint32, of which tensordict clones nothing, .* give int32",
+    ),
     "half a byte to see": (
         env_that_shows(jnp.zeros(2, jnp.int4)),
         "Own: reset shows observation as int4, which torch does not share: give float32",
