@@ -1,17 +1,23 @@
 """Torch's random generators, put back as they were found."""
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
 
-__all__ = ["kept_generators"]
+__all__ = ["ONE_AT_A_TIME", "kept_generators"]
+
+ONE_AT_A_TIME = threading.RLock()
+"""Held while torch's global generators have the numbers of one piece of work: all threads of a
+process draw from the same.
+"""
 
 
 @contextmanager
 def kept_generators(seed: int | None = None) -> Iterator[None]:
     """Torch's global generators, that of the CPU and those of the cards in use, come back as they
-    were.
+    were; what does the same in other threads waits meanwhile.
 
     Args:
         seed: what they begin with meanwhile; None leaves them. ``torch.manual_seed`` would also
@@ -25,7 +31,7 @@ def kept_generators(seed: int | None = None) -> Iterator[None]:
         True
     """
     cards = list(range(torch.cuda.device_count())) if torch.cuda.is_initialized() else []
-    with torch.random.fork_rng(cards):
+    with ONE_AT_A_TIME, torch.random.fork_rng(cards):
         if seed is not None:
             torch.default_generator.manual_seed(seed)
             if cards:
