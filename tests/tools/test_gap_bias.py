@@ -287,8 +287,12 @@ def test_an_algorithm_that_nobody_here_knows_is_one_where_two_agents_have_it() -
     table = gap_and_bias(scores(values), draws=10)
     wanted = {"mlp": "mlp", "lru": "mlp", "sac-mlp": "sac-mlp", "sac-lru": "sac-mlp"}
     assert table.baselines == wanted | {"own-mlp": "mlp"}
-    with pytest.raises(ValueError, match="no scores for the memory-free agent 'mlp', only for own"):
-        gap_and_bias([score for score in scores(values) if score.agent == "own-mlp"], draws=10)
+    alone = [score for score in scores(values) if score.agent == "own-mlp"]
+    with pytest.raises(
+        ValueError, match=r"no scores for .* 'mlp', only for own-mlp; .*: name it, --"
+    ):
+        gap_and_bias(alone, draws=10)
+    assert gap_and_bias(alone, baseline="own-mlp", draws=10).baselines == {"own-mlp": "own-mlp"}
 
 
 def test_the_order_of_the_runs_does_not_matter() -> None:
