@@ -207,6 +207,11 @@ def trouble_of_the_machine(error: BaseException) -> str:
             "TorchRL cannot be loaded by a Python without docstrings: start it with -O in the "
             "place of -OO"
         )
+    if "Disallowed" in said and "transfer" in said:
+        return (
+            "JAX's transfer guard forbids what games need, actions and frames that move between "
+            f"host and device: unset JAX_TRANSFER_GUARD ({one_line(error)[:200]})"
+        )
     if isinstance(error, ValueError) and _JAX_SETTING.search(said):
         return f"JAX refuses a setting of this shell: {one_line(error)[:200]}"
     return missing_platform()

@@ -12,6 +12,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 import pytest
 import tyro
 
@@ -383,6 +385,20 @@ def test_a_warning_that_was_made_an_error_is_told_as_such(
         "arcade-torch: Python was told to stop at warnings (-W error, PYTHONWARN"
     )
     assert "DeprecationWarning: this goes away" in said and said.count("\n") == 1
+
+
+def test_a_transfer_that_jax_is_told_to_forbid_is_told_as_such(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from arcade_torch.tools.commands import list as command
+
+    def put(self: Any) -> None:
+        with jax.transfer_guard("disallow"):
+            jax.jit(lambda x: x + 1)(np.float32(0))
+
+    monkeypatch.setattr(command.List, "run", put)
+    said = one_error(capsys, ["list"], cli.EXIT_FAILED)
+    assert "unset JAX_TRANSFER_GUARD (INVALID_ARGUMENT: Disallowed host-to-device transfer" in said
 
 
 def test_a_folder_may_be_called_like_a_number() -> None:
