@@ -137,8 +137,10 @@ def evaluate(
     Raises:
         ValueError: ``episodes`` is not positive, ``seed`` is out of range, ``observability`` or
             ``game`` is unknown, or an episode does not end in time.
-        TypeError: an option that the game does not have.
+        TypeError: an option that the game does not have, or something that is no agent or no
+            environment of ours.
     """
+    _check_players(agent, env)
     require(
         1 <= episodes <= MOST_EPISODES,
         "episodes",
@@ -166,6 +168,29 @@ def evaluate(
         return _play(agent, env)
     finally:
         env.set_observability(before)
+
+
+def _check_players(agent: Any, env: Any) -> None:
+    """Refuse (TypeError) an agent that cannot act, or says no game where no ``env`` does, and an
+    ``env`` that is none of ours.
+    """
+    names = ["act", "initial_state"] if env is not None else ["act", "initial_state", "config"]
+    missing = [name for name in names if not hasattr(agent, name)]
+    if missing == ["config"]:
+        raise TypeError(
+            f"{type(agent).__name__} does not say which game it plays: hand over env as well"
+        )
+    if missing:
+        raise TypeError(
+            "agent must be an agent, as load(...) and from_pretrained(...) give; got "
+            f"{type(agent).__name__}: arcade_torch.tools.as_policy(policy) makes one of a "
+            "TensorDict policy or a network, to evaluate with env="
+        )
+    if env is not None and not hasattr(env, "set_observability"):
+        raise TypeError(
+            "env must be environments of arcade_torch.make(...) or make_eval_env(...); got "
+            f"{type(env).__name__}: greedy_window of arcade_torch.tools plays any env of TorchRL"
+        )
 
 
 def _play(agent: Any, env: Any) -> EvalResult:

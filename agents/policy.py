@@ -31,6 +31,7 @@ from arcade_torch.models.actor_critic import (
 )
 from arcade_torch.models.encoders import Encoder
 from arcade_torch.models.flat_state import flatten_state
+from arcade_torch.models.generators import kept_generators
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.models.presets import make_network
 
@@ -262,8 +263,7 @@ def build_network(config: TrainConfig) -> Network:
     weights, and no global draw moves.
     """
     # on the CPU, whatever torch's default device is: there the seed says what is drawn
-    with plain_torch(), torch.random.fork_rng(devices=[]), torch.device("cpu"):
-        torch.default_generator.manual_seed(config.seed)
+    with plain_torch(), kept_generators(config.seed), torch.device("cpu"):
         network = _new_network(config)
     for module in network.modules():
         if isinstance(module, Encoder):

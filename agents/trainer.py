@@ -39,6 +39,7 @@ from arcade_torch.agents.torch_settings import plain_torch
 from arcade_torch.devices import pick_devices
 from arcade_torch.envs_jax.game import check_ends
 from arcade_torch.envs_jax.registry import is_built_in
+from arcade_torch.models.generators import ONE_AT_A_TIME
 
 LEARNERS: dict[str, Callable[..., PQN | PPO | DQN]] = {"pqn": PQN, "ppo": PPO, "dqn": DQN}
 COMPILE_BACKEND = "inductor"
@@ -123,15 +124,18 @@ class Trainer:
 
     @contextmanager
     def _own_settings(self) -> Iterator[None]:
-        """While open, torch draws and computes as this run does; others find theirs again."""
-        before = self.random.get_state()
-        self.random.set_state(self.random_state)
-        try:
-            with plain_torch():
-                yield
-        finally:
-            self.random_state = self.random.get_state()
-            self.random.set_state(before)
+        """While open, torch draws and computes as this run does; others find theirs again, and runs
+        in other threads wait.
+        """
+        with ONE_AT_A_TIME:
+            before = self.random.get_state()
+            self.random.set_state(self.random_state)
+            try:
+                with plain_torch():
+                    yield
+            finally:
+                self.random_state = self.random.get_state()
+                self.random.set_state(before)
 
     def warm_up(self) -> None:
         """Random play before training: fills the overlap and calibrates the input scaling; not

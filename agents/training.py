@@ -29,6 +29,7 @@ from arcade_torch.agents.runs.loggers import RunLogger, check_logger
 from arcade_torch.agents.torch_settings import plain_torch
 from arcade_torch.agents.trainer import Trainer
 from arcade_torch.envs_jax.registry import games_of, is_mixture, resolve_id
+from arcade_torch.models.generators import ONE_AT_A_TIME
 
 Progress = Callable[[Mapping[str, Any]], None]
 
@@ -59,8 +60,8 @@ def train(
     SIGINT, SIGTERM and SIGHUP (a dropped connection) end the run at the next update with a
     checkpoint and status ``"interrupted"``; a second SIGINT ends it at once. A killed run goes on
     from its last checkpoint, to the bit on one machine. Torch's global generator is seeded for the
-    run and put back afterwards: two runs in threads of one process draw from it by turns, and
-    neither can be repeated. Take processes, as a study does.
+    run and put back afterwards: runs in threads of one process update by turns, since they share
+    it, and save no time. Take processes, as a study does.
 
     Args:
         config: what to train.
@@ -303,14 +304,16 @@ def own_random_numbers(device: torch.device, seed: int) -> Iterator[None]:
         torch.cuda.init()
         index = torch.cuda.current_device() if device.index is None else device.index
         generators.append(torch.cuda.default_generators[index])
-    states = [generator.get_state() for generator in generators]
-    try:
+    with ONE_AT_A_TIME:
+        states = [generator.get_state() for generator in generators]
         for generator in generators:
             generator.manual_seed(seed)
+    try:
         yield
     finally:
-        for generator, state in zip(generators, states, strict=True):
-            generator.set_state(state)
+        with ONE_AT_A_TIME:
+            for generator, state in zip(generators, states, strict=True):
+                generator.set_state(state)
 
 
 @contextmanager

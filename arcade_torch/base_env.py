@@ -16,13 +16,23 @@ class BaseEnv(EnvBase):
     def rollout(self, *args: Any, **kwargs: Any) -> TensorDictBase:
         """TorchRL's ``rollout``, which warns if a policy wrote for the next step what was dropped,
         since no spec of the env names it: a recurrent state.
+
+        Raises:
+            ValueError: ``out`` has no entries; TorchRL fills those that are there.
         """
+        out = kwargs.get("out")
+        if out is not None and out.is_empty():
+            raise ValueError(
+                "out must be a batch of the same rollout, whose entries are written over; got one "
+                "without entries, which would stay empty: leave out away the first time"
+            )
         steps: TensorDictBase = super().rollout(*args, **kwargs)
         specs = (self.full_observation_spec, self.full_reward_spec, self.full_done_spec)
         carried = set()
         for spec in specs:
             carried.update(spec.keys(True, True))
-        dropped = set(steps["next"].keys(True, True)) - carried
+        after = steps.get("next", None)  # TorchRL leaves out what ``out`` has no entry for
+        dropped = set() if after is None else set(after.keys(True, True)) - carried
         if dropped:
             warn_state_is_dropped(*sorted(dropped, key=str))
         return steps

@@ -10,6 +10,7 @@ import zlib
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -38,13 +39,20 @@ def _torch_dtype(dtype: np.dtype[Any]) -> torch.dtype:
 
 def _bits(leaf: Any) -> Any:
     """The bits of keys of ``jax.random.key``, and of floats that NumPy lacks, such as bfloat16;
-    other arrays as they are.
+    int4 and its like as int8; other arrays as they are.
     """
     if is_key(leaf):
         return jax.random.key_data(leaf)
     if np.dtype(leaf.dtype).kind != "V":
         return leaf
+    if _is_short(leaf.dtype):
+        return leaf.astype(jnp.int8)
     return jax.lax.bitcast_convert_type(leaf, f"uint{8 * np.dtype(leaf.dtype).itemsize}")
+
+
+def _is_short(dtype: Any) -> bool:
+    """Whether these are whole numbers of less than a byte, as int4."""
+    return jnp.issubdtype(dtype, jnp.integer) and jnp.iinfo(dtype).bits < 8
 
 
 def _typed(array: jax.Array, leaf: Any) -> jax.Array:
@@ -53,6 +61,8 @@ def _typed(array: jax.Array, leaf: Any) -> jax.Array:
         kinds: list[Any] = []  # JAX tells it of arrays alone
         jax.eval_shape(lambda keys: kinds.append(jax.random.key_impl(keys)), leaf)
         array = jax.random.wrap_key_data(array, impl=kinds[0])
+    elif _is_short(leaf.dtype):
+        array = array.astype(leaf.dtype)
     elif array.dtype != leaf.dtype:
         array = jax.lax.bitcast_convert_type(array, leaf.dtype)
     return array

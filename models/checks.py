@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
+from arcade_torch.models.generators import kept_generators
 from arcade_torch.models.law_subject import MemoryLawError, subject_of
 from arcade_torch.models.laws import laws_of
 
@@ -59,8 +60,7 @@ def check_memory(
     """
     subject = subject_of(module, input_size, dtype, tolerance)
     discrepancies = {}
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+    with kept_generators(seed):
         for name, law in laws_of(module, subject.dtype, gradients).items():
             discrepancies[name] = law(subject, name)
     return discrepancies
@@ -102,8 +102,7 @@ def law_results(
     """
     subject = subject_of(module, input_size, torch.float64, None)
     results = []
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+    with kept_generators(seed):
         for name, law in laws_of(module, subject.dtype, True).items():
             try:
                 results.append(LawResult(name, True, law(subject, name), ""))

@@ -10,6 +10,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
+from arcade_torch.models.generators import kept_generators
 from arcade_torch.models.law_subject import copy_of
 from arcade_torch.models.memory import Memory, batch_shape, replay_by_steps
 from arcade_torch.models.module_state import Path, arrange, empty_like, shapes_of, tensors_of
@@ -94,7 +95,7 @@ class RecurrentMemory(Memory):
         floating = [weight for weight in module.parameters() if weight.is_floating_point()]
         if floating:
             self.like = floating[0].new_empty(0)
-        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+        with torch.no_grad(), kept_generators():
             # that dropout draws anew is for ``check_memory`` to say
             tried = copy_of(module).eval()
             self._layout, self._leaves = self._learn_layout(tried)

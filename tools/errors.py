@@ -3,6 +3,7 @@ traceback; optional packages, imported on first use.
 """
 
 import errno
+import os
 import re
 import sys
 from importlib import import_module
@@ -51,14 +52,15 @@ WORK_FAILED = ("NonFiniteError", "ClusterLostError", "DiskFullError")
 
 _FULL = "make room and type the same again; what was finished before is whole"
 _TOO_LARGE = "a file may not grow so large here: raise the limit with ulimit -f"
-_FORBIDDEN = "choose another folder, or let it be written"
+_FORBIDDEN = "choose another folder (--out), or let it be written"
+_NOT_ALLOWED = "choose another place (--out), or change its permissions"
 MACHINE = {
     errno.ENOSPC: _FULL,
     errno.EDQUOT: _FULL,
     errno.EFBIG: _TOO_LARGE,
     errno.EROFS: _FORBIDDEN,
-    errno.EACCES: "choose another place, or change its permissions",
-    errno.EPERM: "choose another place, or change its permissions",
+    errno.EACCES: _NOT_ALLOWED,
+    errno.EPERM: _NOT_ALLOWED,
     errno.EMFILE: "too many files are open at once: raise the limit with ulimit -n",
     errno.ENFILE: "too many files are open at once on this machine",
     errno.EIO: "the disk, or the network it is on, failed",
@@ -162,6 +164,8 @@ def _of_a_file(error: OSError) -> str:
     place = "a file" if error.filename is None else str(error.filename)
     verb = "write" if MACHINE.get(error.errno) in (_FULL, _TOO_LARGE, _FORBIDDEN) else "use"
     advice = MACHINE.get(error.errno)
+    if advice == _NOT_ALLOWED and os.path.exists(place) and not os.access(place, os.R_OK):
+        advice = "change its permissions"  # it was to be read
     return f"could not {verb} {place}: {error.strerror}" + (f"; {advice}" if advice else "")
 
 
@@ -175,9 +179,15 @@ _JAX_SETTING = re.compile("for (environment 'JAX_|JAX flag jax_)")
 
 
 def trouble_of_the_machine(error: BaseException) -> str:
-    """What this machine or shell lacks, if that is why JAX or torch raised an error; empty if it is
-    not.
+    """What this machine or shell lacks, or asks for, if that is why JAX or torch raised an error;
+    empty if it is not.
     """
+    if isinstance(error, Warning):
+        return (
+            "Python was told to stop at warnings (-W error, PYTHONWARNINGS), and one came: "
+            f"{type(error).__name__}: {one_line(error)[:200]}; leave that away, or except this one "
+            f"(-W default::{type(error).__name__} behind it)"
+        )
     said = str(error)
     short = (
         "RESOURCE_EXHAUSTED",
@@ -196,6 +206,11 @@ def trouble_of_the_machine(error: BaseException) -> str:
         return (
             "TorchRL cannot be loaded by a Python without docstrings: start it with -O in the "
             "place of -OO"
+        )
+    if "Disallowed" in said and "transfer" in said:
+        return (
+            "JAX's transfer guard forbids what games need, actions and frames that move between "
+            f"host and device: unset JAX_TRANSFER_GUARD ({one_line(error)[:200]})"
         )
     if isinstance(error, ValueError) and _JAX_SETTING.search(said):
         return f"JAX refuses a setting of this shell: {one_line(error)[:200]}"

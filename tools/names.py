@@ -133,17 +133,17 @@ def memory_free(agent: str, baseline: str, others: Iterable[str] = ()) -> re.Mat
     A word in front is an algorithm if it is one of ours, or if one of the ``others``, with memory,
     has it too: ``gated-mlp`` alone is a memory of its own.
     """
-    match = _named_like(agent, baseline)
+    match = named_like(agent, baseline)
     if match is None or match[1].lower().removesuffix("-") in ("", *algorithms()):
         return match
     prefix = match[1].lower()
     for other in others:
-        if other.lower().startswith(prefix) and _named_like(other, baseline) is None:
+        if other.lower().startswith(prefix) and named_like(other, baseline) is None:
             return match
     return None
 
 
-def _named_like(agent: str, baseline: str) -> re.Match[str] | None:
+def named_like(agent: str, baseline: str) -> re.Match[str] | None:
     """The name of an agent as that of the memory-free one, with a word in front and a size."""
     return re.fullmatch(rf"(|\S*-){re.escape(baseline)}( .*)?", agent, re.IGNORECASE)
 

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import redirect_stderr
 from io import StringIO
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, ClassVar
 
 from arcade_torch.tools.imports import FLAG, imported
@@ -94,12 +95,16 @@ def _whole_numbers() -> Any:
 
 
 def _dashed_value(wrong: str, words: Sequence[str]) -> str:
-    """How to write a value that begins with a dash, if tyro missed one for that; else nothing.
+    """How to write a path that begins with a dash and is there, or a value that begins with one, if
+    tyro missed it for that; else nothing.
 
     Example:
         >>> _dashed_value("Missing value for argument '--out'", ["--out", "-x.gif"])
         '; a value that begins with - is written --out=-x.gif'
     """
+    for word in words:
+        if re.match(r"-[^-]", word) and Path(word).exists():
+            return f"; a path that begins with - is written ./{word}"
     missed = re.search(r"'(--[\w.-]+)'", wrong)
     if missed is None or "missing" not in wrong.lower():
         return ""

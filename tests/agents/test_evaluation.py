@@ -7,7 +7,10 @@ from tensordict import TensorDict
 
 import arcade_torch
 from arcade_torch.agents.evaluation import evaluate, held_out_seed, make_env, make_eval_env
+from arcade_torch.agents.policy import make_policy
 from arcade_torch.agents.presets import preset
+from arcade_torch.models import make_network
+from arcade_torch.tools import as_policy
 
 EPISODES = 6
 
@@ -111,3 +114,30 @@ def test_an_environment_is_all_that_the_config_says_about_it(monkeypatch):
     ]
     assert asked == {"num_envs": 4, "seed": 7, "mine_reward": -1.0} | options
     assert make_env(config, 4, 7, "partial")[1]["observability"] == "partial"
+
+
+@pytest.mark.parametrize("player", ["runs/one", make_policy(make_network("small", "mlp"))])
+def test_what_cannot_act_is_refused_in_one_line(player, env):
+    says = f"^agent must be an agent.* got {type(player).__name__}: .*as_policy"
+    with pytest.raises(TypeError, match=says):
+        evaluate(player)
+    with pytest.raises(TypeError, match=says):
+        evaluate(player, env=env)
+
+
+def test_who_says_no_game_needs_environments_of_ours():
+    with pytest.raises(TypeError, match=r"^Clock does not say which game it plays: hand over env"):
+        evaluate(Clock())
+    for other in ("CartPoleEasy", torch.nn.Identity()):
+        with pytest.raises(TypeError, match=r"^env must be environments of arcade_torch.make"):
+            evaluate(Clock(), env=other)
+
+
+def test_a_tensordict_policy_is_evaluated_in_evaluation_mode(env):
+    policy = make_policy(make_network("small", "mlp"), explore=False)
+    modes = []
+    policy[0].register_forward_hook(lambda module, *_: modes.append(module.training))
+    policy[0].encoder.register_forward_hook(lambda module, *_: modes.append(module.training))
+    result = evaluate(as_policy(policy), env=env)
+    assert len(result.returns) == EPISODES
+    assert modes and not any(modes) and policy.training

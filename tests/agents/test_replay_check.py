@@ -12,7 +12,14 @@ from torch import nn
 from torchrl.collectors import Collector
 from torchrl.collectors.utils import split_trajectories
 from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
-from torchrl.envs import GymEnv, InitTracker, StepCounter, TransformedEnv
+from torchrl.envs import (
+    Compose,
+    ConditionalSkip,
+    GymEnv,
+    InitTracker,
+    StepCounter,
+    TransformedEnv,
+)
 from torchrl.modules import (
     ActorValueOperator,
     EGreedyModule,
@@ -29,7 +36,13 @@ from torchrl.modules.utils import get_primers_from_module
 
 import arcade_torch
 from arcade_torch.agents import check_replay, make_policy
-from arcade_torch.models import MemoryModule, make_actor_critic, make_memory, make_network
+from arcade_torch.models import (
+    MemoryModule,
+    SmallEncoder,
+    make_actor_critic,
+    make_memory,
+    make_network,
+)
 
 STEPS = 120
 ROUNDING = 1e-5
@@ -91,6 +104,18 @@ def policy_of(memory: nn.Module, kind: str = "stochastic") -> Any:
     choose = QValueModule(spec=env.action_spec)
     explore = EGreedyModule(env.action_spec, eps_init=0.2, eps_end=0.2)
     return TensorDictSequential(encode, memory, values, choose, explore)
+
+
+def make_policy_for_frames(memory: nn.Module) -> TensorDictSequential:
+    """A greedy policy for our frames."""
+    torch.manual_seed(0)
+    return TensorDictSequential(
+        TensorDictModule(SmallEncoder(128), ["pixels"], ["all_features"]),
+        TensorDictModule(nn.Linear(128, 16), ["all_features"], ["features"]),
+        memory,
+        TensorDictModule(nn.Linear(16, 5), ["remembered"], ["action_value"]),
+        QValueModule(action_space="categorical"),
+    )
 
 
 def cartpole(policy: nn.Module, primed: bool = True) -> TransformedEnv:
@@ -263,6 +288,32 @@ def test_start_flags_may_have_another_name() -> None:
     assert check_replay(policy, batch) < ROUNDING
     batch["begins"] = torch.zeros_like(batch["begins"])
     assert check_replay(policy, batch) > WRONG
+
+
+@pytest.mark.parametrize("skipped", [0, 1])
+def test_steps_that_are_skipped_inside_of_the_primer_are_replayed(skipped: int) -> None:
+    """Start flags and states that the env inside of ``ConditionalSkip`` writes are skipped too."""
+
+    def batch(is_init_key: str) -> tuple[Any, TensorDictBase]:
+        memory = MemoryModule(
+            make_memory("gru", 16, 16), "features", "remembered", is_init_key=is_init_key
+        )
+        policy = make_policy_for_frames(memory)
+        primer = get_primers_from_module(policy, warn=False)
+        counter = StepCounter(step_count_key="all_steps")
+        env: Any = arcade_torch.make("CartPoleEasy", num_envs=2)
+        skip = ConditionalSkip(lambda step: step["all_steps"] % 2 == skipped)
+        if is_init_key == "is_init":
+            env = TransformedEnv(TransformedEnv(env, primer), skip, auto_unwrap=False)
+            around = [counter]
+        else:
+            env = TransformedEnv(env, skip)
+            around = [InitTracker(init_key=is_init_key), counter, primer]
+        env = TransformedEnv(env, Compose(*around), auto_unwrap=False)
+        return policy, env.rollout(60, policy, break_when_any_done=False)
+
+    assert check_replay(*batch("begins")) < ROUNDING
+    assert check_replay(*batch("is_init")) > WRONG
 
 
 def test_a_batch_that_says_nothing_of_the_policy_is_refused_in_one_line() -> None:

@@ -163,3 +163,16 @@ def test_a_wrong_state_is_explained_and_not_loaded(state: Any, message: str) -> 
     with pytest.raises(ValueError, match=re.escape(message)):
         env.set_state(state())
     assert (env.get_state() == before).all()
+
+
+def test_a_rollout_fills_what_is_in_out_and_refuses_an_empty_one() -> None:
+    env = make("CartPoleEasy", num_envs=2, seed=1)
+    first = env.rollout(3, break_when_any_done=False)
+    with pytest.raises(
+        ValueError, match=r"^out must be a batch of the same rollout.*leave out away"
+    ):
+        env.rollout(3, break_when_any_done=False, out=TensorDict(batch_size=[2, 3]))
+    pixels = first.select("pixels").clone()
+    env.set_seed(2)
+    assert env.rollout(3, break_when_any_done=False, out=pixels) is pixels
+    assert not torch.equal(pixels["pixels"], first["pixels"])

@@ -220,6 +220,28 @@ def test_names_with_a_slash_and_random_keys_of_both_styles_survive_a_snapshot() 
     assert (given == expected).all() and (given["reward"] == 1.5).all()
 
 
+def test_numbers_of_less_than_a_byte_survive_a_snapshot() -> None:
+    def look(state: Any) -> Any:
+        return jnp.stack([part.astype(jnp.float32).sum() for part in state.values()])
+
+    def begin(self: Any, key: Any) -> Any:
+        state = {"signed": jnp.full(3, -7, jnp.int4), "unsigned": jnp.full(3, 9, jnp.uint4)}
+        return look(state), state
+
+    def step(self: Any, key: Any, state: Any, action: Any) -> Any:
+        state = {name: part + part.dtype.type(1) for name, part in state.items()}
+        return look(state), state, 0.0, False, {}
+
+    env = made(env_with(reset=begin, step=step))
+    action = torch.zeros(N, dtype=torch.int64)
+    _, root = env.step_and_maybe_reset(env.reset().set("action", action))
+    saved = env.get_state()
+    assert root["observation"][0].tolist() == [-18, 30]
+    another = made(env_with(reset=begin, step=step))
+    after = another.step(another.set_state(saved).set("action", action))["next"]
+    assert after["observation"][0].tolist() == [-15, 33]
+
+
 def test_integers_of_several_choices_arrive_as_integers_and_are_checked() -> None:
     class Table(Count):
         action_space = Box(0, 3, (2,), np.int32)

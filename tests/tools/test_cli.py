@@ -7,10 +7,13 @@ import re
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
 import pytest
 import tyro
 
@@ -342,6 +345,60 @@ def test_options_given_count_even_where_they_equal_the_presets_and_2e5_is_a_numb
         {"noise": 0.5},
         "residual",
     )
+
+
+@pytest.mark.skipif(tyro.__version__ == "1.0.0", reason="this release takes such a word for a path")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["evaluate", "-run"],
+        ["evaluate", "--", "-run", "--episodes", "4"],
+        ["analyze", "saliency", "-run"],
+    ],
+)
+def test_a_path_that_begins_with_a_dash_is_said_to_need_its_folder(
+    words: list[str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert "./-run" not in one_error(capsys, words)
+    (tmp_path / "-run").mkdir()
+    assert "; a path that begins with - is written ./-run (see " in one_error(capsys, words)
+
+
+def test_a_warning_that_was_made_an_error_is_told_as_such(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from arcade_torch.tools.commands import list as command
+
+    def warn(self: Any) -> None:
+        warnings.warn("this goes away", DeprecationWarning, stacklevel=1)
+
+    monkeypatch.setattr(command.List, "run", warn)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert cli.main(["list"]) == cli.EXIT_FAILED
+    said = capsys.readouterr().err
+    assert said.startswith(
+        "arcade-torch: Python was told to stop at warnings (-W error, PYTHONWARN"
+    )
+    assert "DeprecationWarning: this goes away" in said and said.count("\n") == 1
+
+
+def test_a_transfer_that_jax_is_told_to_forbid_is_told_as_such(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from arcade_torch.tools.commands import list as command
+
+    def put(self: Any) -> None:
+        with jax.transfer_guard("disallow"):
+            jax.jit(lambda x: x + 1)(np.float32(0))
+
+    monkeypatch.setattr(command.List, "run", put)
+    said = one_error(capsys, ["list"], cli.EXIT_FAILED)
+    assert "unset JAX_TRANSFER_GUARD (INVALID_ARGUMENT: Disallowed host-to-device transfer" in said
 
 
 def test_a_folder_may_be_called_like_a_number() -> None:

@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -287,8 +288,12 @@ def test_an_algorithm_that_nobody_here_knows_is_one_where_two_agents_have_it() -
     table = gap_and_bias(scores(values), draws=10)
     wanted = {"mlp": "mlp", "lru": "mlp", "sac-mlp": "sac-mlp", "sac-lru": "sac-mlp"}
     assert table.baselines == wanted | {"own-mlp": "mlp"}
-    with pytest.raises(ValueError, match="no scores for the memory-free agent 'mlp', only for own"):
-        gap_and_bias([score for score in scores(values) if score.agent == "own-mlp"], draws=10)
+    alone = [score for score in scores(values) if score.agent == "own-mlp"]
+    with pytest.raises(
+        ValueError, match=r"no scores for .* 'mlp', only for own-mlp; .*: name it, --"
+    ):
+        gap_and_bias(alone, draws=10)
+    assert gap_and_bias(alone, baseline="own-mlp", draws=10).baselines == {"own-mlp": "own-mlp"}
 
 
 def test_the_order_of_the_runs_does_not_matter() -> None:
@@ -438,3 +443,31 @@ def test_agents_without_a_gap_lie_on_one_line() -> None:
 def test_an_unknown_metric_is_refused() -> None:
     with pytest.raises(ValueError, match="metric must be one of eval_final, train_max_ewm"):
         read_scores([], "best")
+
+
+@pytest.mark.parametrize("count", [3, 12, 13, 50])
+def test_the_names_of_many_agents_do_not_cover_each_other_in_a_report(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Fifty stood in a row below a picture of ten centimetres."""
+    values = {
+        (agent, twin): [value / count, 0.5]
+        for value, agent in enumerate(["mlp", *(f"mingru 4x{width}" for width in range(1, count))])
+        for twin in ("full", "partial")
+    }
+    table = gap_and_bias(scores(values), draws=10)
+    drawn = list[Any]()
+    monkeypatch.setattr(style, "svg", lambda figure, name: drawn.append(figure))
+    with drawing("light"):
+        figure.score_panels(table)
+        for picture in drawn:
+            picture.draw_without_rendering()
+            axis = picture.axes[0]
+            labels = [*axis.get_xticklabels(), *axis.get_yticklabels()]
+            names = [label for label in labels if label.get_text().startswith("mingru")]
+            lines = sorted(label.get_position() for label in names)
+            assert len(names) == count - 1
+            places = axis.transData.transform(lines)
+            # along the axis, or of names that are turned across them
+            steps = np.abs(np.diff(places, axis=0)).max(axis=1)
+            assert steps.min() > names[0].get_fontsize() * picture.dpi / 72

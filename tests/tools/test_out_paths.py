@@ -2,6 +2,7 @@
 replaced by files.
 """
 
+import errno
 import os
 import stat
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 from arcade_torch.agents.runs.files import check_writable, write_atomic
 from arcade_torch.tools import cli
+from arcade_torch.tools.errors import one_line
 from tests.tools.fabricated import small_study, write_study
 from tests.tools.test_cli import one_error
 
@@ -111,6 +113,23 @@ def test_what_cannot_be_written_is_known_before(
     monkeypatch.setattr(os, "access", lambda path, mode: path != tmp_path)
     with pytest.raises(PermissionError, match="Permission denied"):
         check_writable(tmp_path / "not/yet/there.json")
+
+
+def test_a_place_that_may_not_be_written_is_told_with_the_option_for_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_study(tmp_path / "study", small_study())
+    run = tmp_path / "run"
+    run.mkdir()
+    monkeypatch.setattr(os, "access", lambda path, mode: not mode & os.W_OK)
+    for words in (["analyze", "saliency", str(run)], ["report", str(tmp_path / "study")]):
+        said = refusal(" ".join(words), capsys)
+        assert "Permission denied; choose another place (--out), or change its perm" in said
+    closed = tmp_path / "closed.json"
+    closed.touch()
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    said = one_line(PermissionError(errno.EACCES, "Permission denied", str(closed)))
+    assert said == f"could not use {closed}: Permission denied; change its permissions"
 
 
 @pytest.mark.parametrize("name", ["curves.jpg", "curves.PNG"])

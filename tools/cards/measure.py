@@ -10,6 +10,7 @@ import torch
 
 import arcade_torch
 from arcade_torch.models import law_results, make_memory
+from arcade_torch.models.generators import kept_generators
 from arcade_torch.models.presets import PRESETS
 from arcade_torch.models.registry import is_built_in
 from arcade_torch.tools.bench import recall
@@ -71,8 +72,7 @@ def measure_card(name: str, tests: bool = True, tell: Tell = lambda part: None) 
         "about": _about(memory),
         "versions": versions(),
     }
-    with torch_threads(1), torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
+    with torch_threads(1), kept_generators(seed=0):
         for part, measure in (
             ("laws", _laws),
             ("cost", _cost),

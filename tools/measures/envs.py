@@ -7,10 +7,11 @@ from tensordict import TensorDictBase, unravel_key
 from torch import Tensor
 
 from arcade_torch.agents.checked import require
+from arcade_torch.models.generators import kept_generators
 from arcade_torch.models.recurrence import Key
 from arcade_torch.tools.measures.keys import Keys
 
-keeps_generator = torch.random.fork_rng(devices=[])
+keeps_generator = kept_generators()
 """Decorates what plays episodes: envs may draw from torch's own generator, and seed it."""
 
 

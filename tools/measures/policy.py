@@ -90,19 +90,20 @@ class Policy:
 
     @torch.no_grad()
     def act(self, obs: Any, state: Any) -> tuple[Tensor, dict[str, Tensor], Any]:
-        """Greedy actions for a batch of observations, as an agent gives them.
+        """Greedy actions for a batch of observations, as an agent gives them, in evaluation mode.
 
         ``obs`` holds ``pixels`` [N, ...], ``last_action`` [N] and ``is_init`` [N, 1].
         """
-        if self.step is not None:
-            action, state = self.step(obs, state)
-            return action, {}, state
-        steps = obs["pixels"].shape[0], 1
-        features = self.encode(obs["pixels"]).unsqueeze(1)
-        out, state = self.remember(
-            features, obs["last_action"].reshape(steps), obs["is_init"].reshape(steps), state
-        )
-        return self.greedy(out[:, 0]), {}, state
+        with self.evaluating():
+            if self.step is not None:
+                action, state = self.step(obs, state)
+                return action, {}, state
+            steps = obs["pixels"].shape[0], 1
+            features = self.encode(obs["pixels"]).unsqueeze(1)
+            out, state = self.remember(
+                features, obs["last_action"].reshape(steps), obs["is_init"].reshape(steps), state
+            )
+            return self.greedy(out[:, 0]), {}, state
 
     @torch.no_grad()
     def features(
@@ -360,7 +361,8 @@ def _of_module(module: TensorDictModuleBase, names: Names) -> Policy:
     wrapper = TensorDictPolicy(module, names)
     reads_as_usual = set(names) <= set(RENAMES)
     if isinstance(wrapper.only_part, MemoryNetwork | ActorCriticNetwork) and reads_as_usual:
-        network = replace(as_policy(wrapper.only_part), module=module)
+        step = wrapper.act_with_network if wrapper.chooses_itself else None
+        network = replace(as_policy(wrapper.only_part), module=module, step=step)
         return _renamed(network, names)
     return Policy(
         encode=wrapper.encode,

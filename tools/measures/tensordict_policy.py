@@ -29,6 +29,7 @@ from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.recurrence import Key
 from arcade_torch.tools.measures.keys import Names, action_index
 from arcade_torch.tools.measures.tensordict_keys import (
+    CHOOSERS,
     OFFERS,
     find_input_keys,
     find_output,
@@ -52,6 +53,8 @@ class TensorDictPolicy:
         output: what the measures look at.
         splits: whether frames are encoded apart from the rest.
         only_part: the one module that computes the outputs, None if there are several.
+        chooses_itself: whether modules of somebody's own stand beside those that the outputs need,
+            which may choose the action.
         reads_last_action: whether it reads ``keys.last_action``.
 
     Raises:
@@ -68,6 +71,9 @@ class TensorDictPolicy:
         self.output = find_output(parts, names)
         needed = needed_parts(parts, self.output.keys, self.state_keys)
         self.only_part = needed[0] if len(needed) == 1 else None
+        self.chooses_itself = any(
+            part not in needed and not isinstance(part, CHOOSERS) for part in parts
+        )
         self._encoder, rest = self._split(needed)
         self._rest = joined_by_state(rest, self.state_keys)
         self._features = self._boundary()
@@ -228,6 +234,23 @@ class TensorDictPolicy:
             return action_index(action, self.keys.action), after
         out = torch.cat([step[key] for key in self.output.keys], -1)
         return self.output.read(out, OFFERS[self.output.kind][0]).argmax(-1), after
+
+    def act_with_network(self, obs: Any, state: TensorDictBase) -> tuple[Tensor, TensorDictBase]:
+        """`act`, with the state as ``only_part``, a network of ours, has it."""
+        network: Any = self.only_part
+        by_tower = hasattr(network, "towers")
+        towers = dict(network.towers.items()) if by_tower else {"": network}
+        keyed = TensorDict({}, state.batch_size, device=state.device)
+        for name, tower in towers.items():
+            if tower.state_keys:
+                keyed.set(tower.state_key, state[name] if by_tower else state)
+        action, after = self.act(obs, keyed)
+        states = state.clone(recurse=False)
+        for name, tower in towers.items():
+            if tower.state_keys:
+                after_tower = after[tower.state_key]
+                states = states.set(name, after_tower) if by_tower else after_tower
+        return action, states
 
 
 def _start_of(

@@ -3,7 +3,6 @@ before it.
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, Unpack, get_args
@@ -19,6 +18,7 @@ from arcade_torch.agents.config import SEED_LIMIT
 from arcade_torch.envs_jax.registry import is_mixture
 from arcade_torch.envs_jax.validation import format_value
 from arcade_torch.tools.imports import load_agent
+from arcade_torch.tools.measures.choices import check_choices
 from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
 from arcade_torch.tools.measures.keys import Keys, Names
 from arcade_torch.tools.measures.policy import Policy, as_policy
@@ -134,7 +134,8 @@ def greedy_windows(
             them.
 
     Raises:
-        ValueError: a number is below 1, or ``end`` is unknown.
+        ValueError: a number is below 1, ``end`` is unknown, or the agent chooses other actions than
+            the best of its outputs, by which decisions are compared.
     """
     require(end in get_args(End), "end", end, f"one of {', '.join(get_args(End))}")
     require(episodes >= 1, "episodes", episodes, "at least 1")
@@ -160,6 +161,8 @@ def greedy_windows(
                 )
             ends = np.where(late, cap - 1, ends)
         for window, n in zip(windows[: episodes - group * size], ends, strict=False):
+            if group == 0:
+                check_choices(agent, window)
             yield window.up_to(int(n))
 
 
@@ -204,8 +207,7 @@ def play(
             raise ValueError(f"an episode must end, got {t} steps without: give env a time limit")
         for row in (playing & (starts == t)).nonzero().flatten().tolist():
             states[row] = None if state is None else state[row : row + 1].clone()
-        with _evaluating(agent):
-            action, _, state = agent.act(obs, state)
+        action, _, state = agent.act(obs, state)
         rows = (playing & (starts <= t) & (t < starts + keep)).nonzero().flatten()
         seen = obs.select("pixels", "last_action", "is_init").set("action", action)
         obs, reward, done = episodes.step(action)
@@ -232,11 +234,6 @@ def play(
 def keys_of(agent: Any) -> Keys:
     """Where an env has what this agent reads."""
     return agent.keys if isinstance(agent, Policy) else Keys()
-
-
-def _evaluating(agent: Any) -> AbstractContextManager[None]:
-    """Evaluation mode of a policy; an agent of ours is in it already."""
-    return agent.evaluating() if isinstance(agent, Policy) else nullcontext()
 
 
 def _window(steps: TensorDictBase, state: Any, ended: bool, seed: int, row: int) -> Window:

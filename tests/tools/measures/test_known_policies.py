@@ -26,6 +26,7 @@ from arcade_torch.tools import (
     steering,
 )
 from arcade_torch.tools.measures.saliency.measure import episode_saliency
+from tests.fake_cards import fake_cards
 from tests.tools.measures.cues import CUES, STEPS, CueEnv
 
 
@@ -319,6 +320,17 @@ def test_an_env_that_draws_from_torch_leaves_its_generator_as_it_was(measure: st
     torch.manual_seed(5)
     PLAYS[measure](policy, env)
     assert torch.equal(torch.rand(3), wanted)
+
+
+@pytest.mark.parametrize("measure", PLAYS)
+def test_the_generators_of_cards_are_left_as_they_were(
+    measure: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``torch.manual_seed`` in an env seeds those too."""
+    policy = TensorDictModule(nn.Linear(CUES, CUES), ["cue"], ["action_value"])
+    cards = fake_cards(monkeypatch)
+    PLAYS[measure](policy, Tutorial(4))
+    assert all(bool((state == 7).all()) for state in cards.states)
 
 
 class Unseeded(CueEnv):

@@ -136,12 +136,12 @@ def contamination(
     player, env = resolve_agent(agent, env, observability, **names)
     disturbance = Shuffle() if shuffle else Noise(np.array(sigmas, np.float64), clip)
     steps = np.unique(np.array(delays, np.int64))
-    probe = Probe(
+    disturber = Disturber(
         player, output_of_actions(player, target), disturbance, steps, starts, feedback, seed
     )
     episodes = 4 * math.ceil(starts / disturbance.points_an_episode) + 16
-    probe.run(greedy_windows(player, env, episodes=episodes, seed=seed, cap=cap), progress)
-    return probe.result()
+    disturber.run(greedy_windows(player, env, episodes=episodes, seed=seed, cap=cap), progress)
+    return disturber.result()
 
 
 def output_of_actions(model: Any, target: Target) -> str:
@@ -210,7 +210,7 @@ class Changes(NamedTuple):
     kl: Array
 
 
-class Probe:
+class Disturber:
     """Disturbs one trajectory after another, and gathers how the decisions change."""
 
     def __init__(

@@ -64,6 +64,8 @@ MOST_NAMED = 8
 """Agents whose names stand at their points."""
 MOST_BESIDE = 12
 """Agents whose bars go into panels side by side; more get the whole width."""
+LINE = 0.16
+"""Inches of an agent's line where there are more in a panel."""
 
 
 def gap_bias(options: ScoreOptions, progress: Progress | None) -> Made:
@@ -249,6 +251,27 @@ def plot_bars(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
         axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
 
 
+def plot_lines(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
+    """The same of many agents in a narrow panel: a line each, with its interval."""
+    colours = agent_colours([row.agent for row in rows])
+    rows = list(filter(_has_bias, rows)) if name == "bias" else rows
+    agents = [row.agent for row in rows]
+    intervals = [getattr(row, name) for row in rows]
+    places = range(len(agents))
+    axis.barh(
+        places,
+        [interval.value for interval in intervals],
+        0.72,
+        color=[colours[agent] for agent in agents],
+        xerr=_whiskers(intervals),
+        error_kw={"lw": 1},
+    )
+    axis.set_yticks(places, agents, fontsize=8)
+    axis.set_ylim(len(agents) - 0.5, -0.5)
+    axis.set(title=PANELS[name][0], xlabel=PANELS[name][1])
+    axis.axvline(0.0, color=NEUTRAL, lw=1)
+
+
 def _whiskers(intervals: Sequence[Interval]) -> Any:
     """Lengths of the error bars of intervals, [2, n]."""
     return whiskers(*np.reshape(intervals, (-1, 3)).T)
@@ -409,7 +432,11 @@ def score_panels(table: GapBias) -> list[str]:
         rows = [row for row in table.rows if row.agent != table.baselines[row.agent]]
         if name == "bias" and not any(map(_has_bias, rows)):
             continue
-        figure, axes = panels(1, 1, style.PANEL)
-        plot_bars(table.rows, axes[0, 0], name)
+        if len(table.rows) <= MOST_BESIDE:
+            figure, axes = panels(1, 1, style.PANEL)
+            plot_bars(table.rows, axes[0, 0], name)
+        else:
+            figure, axes = panels(1, 1, (style.PANEL[0], 1 + LINE * len(table.rows)))
+            plot_lines(table.rows, axes[0, 0], name)
         pictures.append(style.svg(figure, name))
     return pictures

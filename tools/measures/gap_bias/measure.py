@@ -22,7 +22,7 @@ from arcade_torch.agents.checked import require
 from arcade_torch.envs_jax.registry import DIFFICULTIES, is_mixture
 from arcade_torch.tools.measures import bootstrap
 from arcade_torch.tools.measures.bootstrap import Array, Interval, percentile_interval
-from arcade_torch.tools.names import find_baselines
+from arcade_torch.tools.names import find_baselines, named_like
 from arcade_torch.tools.runs import Score
 from arcade_torch.tools.scores import Source, read_scores
 
@@ -245,10 +245,14 @@ def _baselines(cells: Cells, baseline: str) -> dict[str, str | None]:
     agents = list(dict.fromkeys(agent for agent, _, _ in cells))
     memory_free = find_baselines(agents, baseline)
     if not memory_free:
+        alike = [agent for agent in agents if named_like(agent, baseline)]
+        advice = f"train --memory {baseline} on the same games and both twins"
+        if alike:
+            advice = f"name it, --baseline {alike[0]}, if that is one, or {advice}"
         raise ValueError(
             f"no scores for the memory-free agent {baseline!r}, only for "
             f"{', '.join(agents) or 'nobody'}; the gap and the bias of a memory are against one: "
-            f"train --memory {baseline} on the same games and both twins"
+            f"{advice}"
         )
     return {agent: memory_free.get(agent) for agent in [*memory_free.values(), *agents]}
 
