@@ -168,10 +168,12 @@ def plain_legend(axis: Any) -> None:
 
 
 def agent_markers(agents: Iterable[str], colours: Mapping[str, str]) -> dict[str, str]:
-    """A marker for every agent: two that share a colour have different ones, up to 64 agents."""
-    markers: dict[str, str] = {}
+    """A marker for every agent, in whatever order they come: two that share a colour have different
+    ones, up to 64 agents.
+    """
+    markers = dict.fromkeys(agents, "")
     taken = set[tuple[str, str]]()
-    for place, agent in enumerate(agents):
+    for place, agent in enumerate(sorted(markers)):
         colour = colours[agent]
         turned = [MARKERS[(place + step) % len(MARKERS)] for step in range(len(MARKERS))]
         free = [marker for marker in turned if (marker, colour) not in taken]
@@ -201,17 +203,18 @@ def legend_above(
 
 
 def agent_colours(names: Sequence[str]) -> dict[str, str]:
-    """A colour for every agent: that of its memory, or a spare one where there is none or another
-    agent has it.
+    """A colour for every agent, in whatever order they come: that of its memory, or a spare one
+    where there is none or another agent has it.
     """
+    in_order = sorted(set(names))
     usual: dict[str, str] = {}  # of the agents whose memories have one: it is theirs
-    for name in names:
+    for name in in_order:
         memory = name.lower().partition(" ")[0].rpartition("-")[2]
         colour = AGENT_COLOURS.get(memory)
         if colour is not None and colour not in usual.values():
             usual[name] = colour
-    colours: dict[str, str] = {}
-    for place, name in enumerate(names):
+    colours = dict.fromkeys(names, "")
+    for place, name in enumerate(in_order):
         taken = {*usual.values(), *colours.values()}
         free = [spare for spare in SPARE_COLOURS if spare not in taken]
         spare = free[0] if free else SPARE_COLOURS[place % len(SPARE_COLOURS)]
