@@ -785,6 +785,28 @@ def test_other_weights_in_the_same_folder_are_measured_anew(
     assert len(list((tmp_path / "analysis").iterdir())) == 2
 
 
+class Typed(torch.nn.Module):
+    """A weight in half precision, as a memory of somebody else may have one, beside a scalar."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1, dtype=torch.bfloat16))
+        self.register_buffer("steps", torch.tensor(3))
+        self.register_buffer("phases", torch.ones(2, dtype=torch.complex64))
+
+
+def test_weights_of_any_type_are_told_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before: NumPy knows no bfloat16, and every measure of such an agent ended in a TypeError."""
+    agent = Agent(preset("smoke", env="MineSweeperEasy"), Typed())
+    monkeypatch.setattr(checkpoints, "load_agent", lambda path: agent)
+    (tmp_path / "config.json").write_text("{}")
+    for value in (1.0, 1.0078125):  # neighbours
+        torch.nn.init.constant_(agent.network.weight, value)
+        assert checkpoints.measure_run(tmp_path, weight_of, {})[1] == Weight(value)
+
+
 def test_the_confidence_that_is_asked_for_is_that_of_bands_and_bars(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
