@@ -183,18 +183,26 @@ def agent_markers(agents: Iterable[str], colours: Mapping[str, str]) -> dict[str
 
 
 def legend_above(
-    figure: Any, handles: Sequence[Any], most: int = 8, loc: str = "outside upper center"
+    figure: Any,
+    handles: Sequence[Any],
+    most: int = 8,
+    loc: str = "outside upper center",
+    title: str = "",
 ) -> None:
-    """Put a legend above the panels, in as many columns as its names leave room for; the figure
-    grows with its lines.
+    """Put a legend above the panels, in as many columns as its names and a title at the left leave
+    room for; the figure grows with its lines.
     """
     legend = figure.legend(handles=handles, loc=loc, ncols=1)
     size = legend.prop.get_size_in_points()
+    texts = list(legend.get_texts())
+    if title:
+        texts.append(figure.suptitle(title, x=0.01, ha="left"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of letters that the font lacks, see `save_figure`
-        widths = [text.get_window_extent().width for text in legend.get_texts()]
-    column_pt = 72 / figure.dpi * max(widths, default=0.0) + 5 * size  # with the sample of a line
-    room = int(72 * figure.get_figwidth() / column_pt)
+        widths = [72 / figure.dpi * text.get_window_extent().width for text in texts]
+    title_pt = widths.pop() + 3 * size if title else 0.0
+    column_pt = max(widths, default=0.0) + 5 * size  # with the sample of a line
+    room = int((72 * figure.get_figwidth() - title_pt) / column_pt)
     columns = max(1, min(most, len(handles), room))
     lines = math.ceil(len(handles) / columns)
     figure.set_figheight(figure.get_figheight() + 1.6 * size / 72 * max(0, lines - 2))

@@ -173,8 +173,8 @@ def _picture(
     axes[0, 0].set_ylabel("score: 0 a guess, 1 perfect")
     for fact, axis in zip(facts, axes[0, 1:], strict=True):
         plot_steps(scores, fact, axis, colours)
-    figure.suptitle(f"{game}, {style.TWIN_NAMES[twin]}", x=0.01, ha="left")
-    style.legend_above(figure, _legend(scores, colours), 6, "outside upper right")
+    title = f"{game}, {style.TWIN_NAMES[twin]}"
+    style.legend_above(figure, _legend(scores, colours), 6, "outside upper right", title)
     rows = list[dict[str, Any]]()
     for agent, of_agent in scores.items():
         rows += _rows(agent, game, twin, len(agents[agent]), of_agent)
