@@ -785,6 +785,26 @@ def test_other_weights_in_the_same_folder_are_measured_anew(
     assert len(list((tmp_path / "analysis").iterdir())) == 2
 
 
+def test_names_of_facts_are_not_written_over_each_other() -> None:
+    """Before: angular_velocity of CartPole began in the name before it and ended in the next."""
+    interval = Interval(0.5, 0.4, 0.6)
+    facts = ("angle", "angular_velocity", "angular_position", "velocity")
+    scores = {
+        agent: {(fact, "frame"): beliefs.Scores(interval, *np.full((3, 2), 0.5)) for fact in facts}
+        for agent in ("lru", "mlp")
+    }
+    with drawing("light") as plt:
+        figure, axis = plt.subplots(figsize=(4.2, 3.6), layout="constrained")
+        beliefs.plot_bars(scores, axis, {"lru": "#0072b2", "mlp": "#000000"})
+        figure.draw_without_rendering()
+        names = axis.get_xticklabels()
+        assert [name.get_text() for name in names] == list(facts)
+        lines = [name.get_rotation() for name in names]
+        ends = [name.get_window_extent().x1 for name in names]
+    starts = np.diff(ends) * np.sin(np.radians(lines[1:]))  # between the lines of two names
+    assert (starts > 12).all()  # pixels, a small line's height
+
+
 class Typed(torch.nn.Module):
     """A weight in half precision, as a memory of somebody else may have one, beside a scalar."""
 
