@@ -145,7 +145,7 @@ def _refused(repo: str, name: str, error: Exception) -> HubError:
     place = f"{name} of {repo}" if name else repo
     remedy = ""
     if _is_unanswered(error):
-        remedy = "; is the network up? What was fetched before is kept"
+        remedy = "; is the network up?"
     elif _is_missing(error):
         remedy = "; was it put there by arcade-torch push?"
     elif "HfHubHTTPError" in _kinds(error):
