@@ -61,8 +61,9 @@ def from_pretrained(
         check_hash(sha256)
     folder = agent_folder(name)
     if not folder.is_dir() and hub.is_repo(os.fspath(name)):
-        folder = hub.download(os.fspath(name), MOST_BYTES, revision=revision)
-    elif revision is not None:
+        fetched = hub.download(os.fspath(name), MOST_BYTES, revision=revision)
+        return agent_of(read_fetched(fetched, sha256), device)
+    if revision is not None:
         raise ValueError(f"revision = {revision!r}: {name} is a folder here, which has none")
     return agent_of(read_shared(folder, sha256), device)
 
@@ -79,7 +80,24 @@ def read_shared(folder: Path, sha256: str | None = None) -> Checkpoint:
         )
     if not is_bundle(folder):
         return find_checkpoint(folder)
-    checkpoint = load_bundle(folder, sha256)
+    return _with_known_memory(load_bundle(folder, sha256), folder)
+
+
+def read_fetched(folder: Path, sha256: str | None = None) -> Checkpoint:
+    """What :func:`arcade_torch.agents.hub.download` put into a folder of the hub's cache, where it
+    stays, damaged or not; raises as :func:`from_pretrained`.
+    """
+    try:
+        checkpoint = load_bundle(folder, sha256)
+    except CheckpointError as error:
+        raise CheckpointError(
+            f"{error}; if this copy is damaged, delete {folder.parent.parent} and fetch it again"
+        ) from error
+    return _with_known_memory(checkpoint, folder)
+
+
+def _with_known_memory(checkpoint: Checkpoint, folder: Path) -> Checkpoint:
+    """Refuse an agent whose memory model is registered nowhere."""
     memory = checkpoint.config.memory
     if memory not in (*memory_names(), *ALIASES, FEED_FORWARD):
         raise CheckpointError(

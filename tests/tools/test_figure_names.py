@@ -18,7 +18,7 @@ from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.figures import logs
 from arcade_torch.tools.figures.catalogue import FIGURES
 from arcade_torch.tools.figures.fonts import save_figure
-from arcade_torch.tools.figures.style import drawing, new_figure, svg
+from arcade_torch.tools.figures.style import drawing, legend_above, new_figure, svg
 from arcade_torch.tools.measures.gap_bias import ScoreOptions
 from arcade_torch.tools.measures.gap_bias.figure import gap_bias, returns
 from arcade_torch.tools.names import printable
@@ -202,6 +202,38 @@ def test_many_agents_are_numbered_in_gap_bias_and_named_beside_it(
         assert all(text.get_window_extent().x1 <= right for text in named)
     looks = {(bar.lines[0].get_marker(), bar.lines[0].get_color()) for bar in axis.containers}
     assert len(looks) == count + 1
+
+
+def test_names_of_agents_with_equal_scores_can_be_read(tmp_path: Path) -> None:
+    """Before: where all agents solve a task their names were written over each other."""
+    agents = ["lru 1x128", "gru 1x128", "lru 2x512"]
+    lines = ["agent,game,observability,seed,score"]
+    for agent, twin, seed in product(("mlp", *agents), ("full", "partial"), (0, 1)):
+        lines.append(f"{agent},SignpostEasy,{twin},{seed},{0.7 + 0.1 * seed}")
+    (tmp_path / "scores.csv").write_text("\n".join(lines) + "\n")
+    with drawing("light"):
+        options = ScoreOptions(runs=(tmp_path / "scores.csv",), draws=10)
+        (picture,) = gap_bias(options, None).pictures
+        picture.figure.draw_without_rendering()
+        (axis,) = picture.figure.axes
+        assert {text.get_text() for text in axis.texts} == {"mlp", *agents}
+        assert not overlapping([text.get_window_extent() for text in axis.texts])
+
+
+@pytest.mark.parametrize("most", [1, 6])
+def test_a_legend_stands_beside_the_title(most: int) -> None:
+    """Before: with six agents it was written over a title of a long name."""
+    with drawing("light") as plt:
+        figure, axis = plt.subplots(figsize=(9.5, 7.6), layout="constrained")
+        for agent in (f"pqn-memory{place} 1x128" for place in range(6)):
+            axis.plot([0, 1], [0, 1], label=agent)
+        handles, _ = axis.get_legend_handles_labels()
+        legend_above(figure, handles, most, "outside upper right", "NoisyCartPoleMedium-v0, POMDP")
+        figure.draw_without_rendering()
+        (legend,) = figure.legends
+        title = figure._suptitle.get_window_extent()
+        assert title.x1 < legend.get_window_extent().x0
+        assert legend.get_window_extent().y0 > axis.get_window_extent().y1
 
 
 def test_bars_and_legends_of_many_agents_stand_inside_the_picture(tmp_path: Path) -> None:

@@ -55,6 +55,7 @@ def test_a_final_evaluation_with_other_things_than_numbers_is_made_again(
         ({"total_frames": 10**400}, r"from 1 to 10\*\*15"),
         ({"seeds": [10**400]}, r"below 2\*\*32"),
         ({"games": ["../../x"]}, r"names of folders.*got '\.\./\.\./x'"),
+        ({"games": ["CartPoleEasy+SkittlesEasy"]}, r"train --env A\+B trains an agent of several"),
         ({"memories": ["a/b"]}, "names of folders"),
         ({"name": ".."}, "name must be made of letters"),
         ({"settings": 5}, "settings must be a mapping of option names"),

@@ -17,7 +17,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arcade_torch.tools import cli, gap_and_bias, players, report, reports
-from arcade_torch.tools.figures.style import agent_colours, drawing, svg
+from arcade_torch.tools.figures.style import agent_colours, agent_markers, drawing, svg
 from arcade_torch.tools.measures.saliency import figure as saliency
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import findings
@@ -318,6 +318,17 @@ def test_references_of_a_game_that_was_changed_are_made_anew(
 )
 def test_no_two_agents_share_a_colour(names: list[str]) -> None:
     assert len(set(agent_colours(names).values())) == len(names)
+
+
+@given(st.permutations(["pqn-gru", "pqn-mlp", "ppo-gru", "ppo-mlp", "dqn-gru", "dqn-mlp"]))
+def test_an_agent_looks_the_same_in_every_figure(names: list[str]) -> None:
+    """Before: curves, in the order of the grid, and Gap and Bias, memory-free agents first,
+    exchanged the colours of two agents.
+    """
+    colours = agent_colours(names)
+    assert list(colours) == names and colours == agent_colours(sorted(names))
+    markers = agent_markers(names, colours)
+    assert list(markers) == names and markers == agent_markers(sorted(names), colours)
 
 
 def test_an_agent_whose_name_is_blank_has_a_colour_too() -> None:

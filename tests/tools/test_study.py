@@ -221,6 +221,21 @@ def test_a_study_with_other_settings_is_refused_but_a_larger_grid_is_welcome(
     assert len(engine.done) == 4 and all("seed2" in name for name in engine.done)
 
 
+def test_what_changes_no_result_may_change_in_the_file_of_a_study(tmp_path: Path) -> None:
+    """Before: a study that was to go on with two threads was refused, though docs/cluster.md says
+    that threads may differ.
+    """
+    what = small_study(settings={"threads": 1, "pqn": {"lam": 0.65}})
+    folder = write_study(tmp_path / "s", what)
+    free = {"threads": 2, "eval_every": 512, "checkpoint_every": 0}
+    other = small_study(settings=free | {"pqn": {"lam": 0.65}}, seeds=3)
+    engine = Fabricator(other)
+    carry_out(other, folder.root, engine)
+    assert len(engine.done) == 4 and all("seed2" in name for name in engine.done)
+    with pytest.raises(FileExistsError, match=r"settings = \{'pqn.lam': 0.65\}, not \{"):
+        carry_out(small_study(settings=free), folder.root, engine)
+
+
 def change_config(run: Path, change: Callable[[dict[str, Any]], object]) -> None:
     """Change the settings that a run says it was made with."""
     record = json.loads((run / "config.json").read_text())

@@ -87,7 +87,7 @@ class Pull(Command):
         """Fetch, check, write."""
         from arcade_torch.agents import hub
         from arcade_torch.agents.policy import agent_of
-        from arcade_torch.agents.pretrained import read_shared
+        from arcade_torch.agents.pretrained import read_fetched, read_shared
         from arcade_torch.agents.runs.bundle import (
             CONFIG,
             MOST_BYTES,
@@ -106,11 +106,13 @@ class Pull(Command):
         source = agent_folder(Path(self.repo).expanduser())
         if is_folder(self.repo) or source.is_dir():
             require(self.revision is None, "--revision", self.revision, "left out: it is a folder")
+            checkpoint = read_shared(source, self.sha256)
         else:
             allowed = "owner/name, or a folder"
             require(hub.is_repo(self.repo), "the repository", self.repo, allowed)
             source = hub.download(self.repo, sizes, extras, self.revision)
-        agent = agent_of(read_shared(source, self.sha256), "cpu")
+            checkpoint = read_fetched(source, self.sha256)
+        agent = agent_of(checkpoint, "cpu")
         if source.is_dir() and not is_bundle(source):
             raise ValueError(
                 f"{source} is no agent that was shared, it has no {WEIGHTS}: a run folder can be "

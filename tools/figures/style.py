@@ -168,10 +168,12 @@ def plain_legend(axis: Any) -> None:
 
 
 def agent_markers(agents: Iterable[str], colours: Mapping[str, str]) -> dict[str, str]:
-    """A marker for every agent: two that share a colour have different ones, up to 64 agents."""
-    markers: dict[str, str] = {}
+    """A marker for every agent, in whatever order they come: two that share a colour have different
+    ones, up to 64 agents.
+    """
+    markers = dict.fromkeys(agents, "")
     taken = set[tuple[str, str]]()
-    for place, agent in enumerate(agents):
+    for place, agent in enumerate(sorted(markers)):
         colour = colours[agent]
         turned = [MARKERS[(place + step) % len(MARKERS)] for step in range(len(MARKERS))]
         free = [marker for marker in turned if (marker, colour) not in taken]
@@ -181,18 +183,26 @@ def agent_markers(agents: Iterable[str], colours: Mapping[str, str]) -> dict[str
 
 
 def legend_above(
-    figure: Any, handles: Sequence[Any], most: int = 8, loc: str = "outside upper center"
+    figure: Any,
+    handles: Sequence[Any],
+    most: int = 8,
+    loc: str = "outside upper center",
+    title: str = "",
 ) -> None:
-    """Put a legend above the panels, in as many columns as its names leave room for; the figure
-    grows with its lines.
+    """Put a legend above the panels, in as many columns as its names and a title at the left leave
+    room for; the figure grows with its lines.
     """
     legend = figure.legend(handles=handles, loc=loc, ncols=1)
     size = legend.prop.get_size_in_points()
+    texts = list(legend.get_texts())
+    if title:
+        texts.append(figure.suptitle(title, x=0.01, ha="left"))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of letters that the font lacks, see `save_figure`
-        widths = [text.get_window_extent().width for text in legend.get_texts()]
-    column_pt = 72 / figure.dpi * max(widths, default=0.0) + 5 * size  # with the sample of a line
-    room = int(72 * figure.get_figwidth() / column_pt)
+        widths = [72 / figure.dpi * text.get_window_extent().width for text in texts]
+    title_pt = widths.pop() + 3 * size if title else 0.0
+    column_pt = max(widths, default=0.0) + 5 * size  # with the sample of a line
+    room = int((72 * figure.get_figwidth() - title_pt) / column_pt)
     columns = max(1, min(most, len(handles), room))
     lines = math.ceil(len(handles) / columns)
     figure.set_figheight(figure.get_figheight() + 1.6 * size / 72 * max(0, lines - 2))
@@ -201,17 +211,18 @@ def legend_above(
 
 
 def agent_colours(names: Sequence[str]) -> dict[str, str]:
-    """A colour for every agent: that of its memory, or a spare one where there is none or another
-    agent has it.
+    """A colour for every agent, in whatever order they come: that of its memory, or a spare one
+    where there is none or another agent has it.
     """
+    in_order = sorted(set(names))
     usual: dict[str, str] = {}  # of the agents whose memories have one: it is theirs
-    for name in names:
+    for name in in_order:
         memory = name.lower().partition(" ")[0].rpartition("-")[2]
         colour = AGENT_COLOURS.get(memory)
         if colour is not None and colour not in usual.values():
             usual[name] = colour
-    colours: dict[str, str] = {}
-    for place, name in enumerate(names):
+    colours = dict.fromkeys(names, "")
+    for place, name in enumerate(in_order):
         taken = {*usual.values(), *colours.values()}
         free = [spare for spare in SPARE_COLOURS if spare not in taken]
         spare = free[0] if free else SPARE_COLOURS[place % len(SPARE_COLOURS)]

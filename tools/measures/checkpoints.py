@@ -142,9 +142,13 @@ def _arguments(measure: Callable[..., Any], options: Mapping[str, Any]) -> dict[
 
 def _hash_of_weights(network: Any) -> str:
     """Sixteen hex digits that tell the weights of one network from those of another."""
+    import torch
+
     weights = hashlib.sha256()
     for name, value in sorted(network.state_dict().items()):
-        weights.update(name.encode() + value.detach().cpu().contiguous().numpy().tobytes())
+        # as bytes: NumPy does not know all types that weights have
+        stored = value.detach().cpu().contiguous().reshape(-1).view(torch.uint8)
+        weights.update(name.encode() + stored.numpy().tobytes())
     return weights.hexdigest()[:16]
 
 

@@ -15,6 +15,7 @@ from arcade_torch.agents.differences import flatten
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.runs.files import read_text
 from arcade_torch.tools.names import AgentKey, agent_names, find_baselines
+from arcade_torch.tools.runs import FREE
 
 STUDY_PRESETS = ("demo", "paper-easy", "paper", "size-sweep")
 MOST_SEEDS = 10_000
@@ -24,6 +25,7 @@ MOST_BYTES = 1 << 17
 MOST_DOTS = 1_000
 """In a line of it: a name of many parts takes tomllib minutes."""
 _FOLDERS = "names of folders, of letters, digits, dots and dashes"
+_GAMES = f"{_FOLDERS}, one game each (train --env A+B trains an agent of several)"
 _FOLDER = r"(?!\.*$)[\w.\-]{1,80}"
 
 
@@ -32,7 +34,7 @@ def _text(allowed: str, form: str) -> Any:
 
 
 _AXES: dict[str, Any] = {
-    "games": _text(_FOLDERS, _FOLDER),
+    "games": _text(_GAMES, _FOLDER),
     "memories": _text(_FOLDERS, _FOLDER),
     "algorithms": _text(_FOLDERS, _FOLDER),
     "observability": _text("full or partial, or a list of the two", "full|partial"),
@@ -233,10 +235,11 @@ class Study:
         """What may not change between two invocations in one folder: everything that decides a
         run's result.
         """
+        settings = flatten(self.settings)
         return {
             "preset": self.preset,
             "total_frames": self.total_frames,
-            "settings": flatten(self.settings),
+            "settings": {name: settings[name] for name in settings if name not in FREE},
             "memory_options": flatten(self.memory_options),
         }
 

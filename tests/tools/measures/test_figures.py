@@ -785,6 +785,48 @@ def test_other_weights_in_the_same_folder_are_measured_anew(
     assert len(list((tmp_path / "analysis").iterdir())) == 2
 
 
+def test_names_of_facts_are_not_written_over_each_other() -> None:
+    """Before: angular_velocity of CartPole began in the name before it and ended in the next."""
+    interval = Interval(0.5, 0.4, 0.6)
+    facts = ("angle", "angular_velocity", "angular_position", "velocity")
+    scores = {
+        agent: {(fact, "frame"): beliefs.Scores(interval, *np.full((3, 2), 0.5)) for fact in facts}
+        for agent in ("lru", "mlp")
+    }
+    with drawing("light") as plt:
+        figure, axis = plt.subplots(figsize=(4.2, 3.6), layout="constrained")
+        beliefs.plot_bars(scores, axis, {"lru": "#0072b2", "mlp": "#000000"})
+        figure.draw_without_rendering()
+        names = axis.get_xticklabels()
+        assert [name.get_text() for name in names] == list(facts)
+        lines = [name.get_rotation() for name in names]
+        ends = [name.get_window_extent().x1 for name in names]
+    starts = np.diff(ends) * np.sin(np.radians(lines[1:]))  # between the lines of two names
+    assert (starts > 12).all()  # pixels, a small line's height
+
+
+class Typed(torch.nn.Module):
+    """A weight in half precision, as a memory of somebody else may have one, beside a scalar."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(1, dtype=torch.bfloat16))
+        self.register_buffer("steps", torch.tensor(3))
+        self.register_buffer("phases", torch.ones(2, dtype=torch.complex64))
+
+
+def test_weights_of_any_type_are_told_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before: NumPy knows no bfloat16, and every measure of such an agent ended in a TypeError."""
+    agent = Agent(preset("smoke", env="MineSweeperEasy"), Typed())
+    monkeypatch.setattr(checkpoints, "load_agent", lambda path: agent)
+    (tmp_path / "config.json").write_text("{}")
+    for value in (1.0, 1.0078125):  # neighbours
+        torch.nn.init.constant_(agent.network.weight, value)
+        assert checkpoints.measure_run(tmp_path, weight_of, {})[1] == Weight(value)
+
+
 def test_the_confidence_that_is_asked_for_is_that_of_bands_and_bars(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

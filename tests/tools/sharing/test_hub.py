@@ -3,14 +3,19 @@
 import hashlib
 import importlib.util
 import os
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from arcade_torch.agents.hub import is_repo
+from arcade_torch.agents import from_pretrained
+from arcade_torch.agents import hub as hub_module
+from arcade_torch.agents.hub import HubError, download, is_repo
+from arcade_torch.agents.runs.files import CheckpointError
 from arcade_torch.agents.runs.shipped import SHIPPED
 from tests.tools.sharing.fake_hub import FakeHub, serving
 
@@ -90,3 +95,108 @@ def test_names_of_repositories(name: str) -> None:
 )
 def test_names_of_none(name: str) -> None:
     assert not is_repo(name)
+
+
+class HfHubHTTPError(OSError):
+    """As in huggingface_hub.errors: the hub has answered."""
+
+
+class RemoteEntryNotFoundError(HfHubHTTPError):
+    """There is no such file in the repository."""
+
+
+class LocalEntryNotFoundError(FileNotFoundError):
+    """The hub could not be asked, and the file is not in the cache."""
+
+
+class FakeClient:
+    """As much of huggingface_hub as is used: a cache with one commit, and what asking raises."""
+
+    def __init__(self, cache: Path, ask: Callable[[str], object]) -> None:
+        self.snapshot = cache / "models--a--b" / "snapshots" / "c0ffee"
+        self.ask = ask
+
+    def hf_hub_url(self, repo: str, name: str, revision: str | None) -> str:
+        return name
+
+    def get_hf_file_metadata(self, name: str) -> SimpleNamespace:
+        self.ask(name)
+        return SimpleNamespace(size=1, commit_hash="c0ffee")
+
+    def hf_hub_download(self, repo: str, name: str, revision: str | None) -> str:
+        return str(self.snapshot / name)
+
+    def try_to_load_from_cache(self, repo: str, name: str, revision: str | None) -> str | None:
+        file = self.snapshot / name
+        return str(file) if file.is_file() and revision in (None, "c0ffee") else None
+
+
+def fails(error: Exception, name: str = "") -> Callable[[str], object]:
+    """Asking that fails, for one file or for all."""
+
+    def ask(asked: str) -> None:
+        if not name or asked == name:
+            raise error
+
+    return ask
+
+
+@pytest.fixture
+def client(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Callable[[Callable[[str], object]], FakeClient]:
+    def make(ask: Callable[[str], object]) -> FakeClient:
+        fake = FakeClient(tmp_path, ask)
+        monkeypatch.setattr(hub_module, "_package", lambda: fake)
+        return fake
+
+    return make
+
+
+Client = Callable[[Callable[[str], object]], FakeClient]
+
+
+@pytest.mark.parametrize(
+    ("error", "remedy"),
+    [
+        (TimeoutError("timed out"), "is the network up"),
+        (LocalEntryNotFoundError("cannot find it"), "is the network up"),
+        (RemoteEntryNotFoundError("404 Client Error."), "404 Client Error; was it put there by"),
+        (HfHubHTTPError("401 Client Error."), "are you logged in"),
+        (OSError(28, "No space left on device"), "No space left on device"),
+    ],
+)
+def test_a_failed_download_says_what_helps(client: Client, error: Exception, remedy: str) -> None:
+    """Before: every one of them asked for another name or a login."""
+    client(fails(error))
+    with pytest.raises(HubError, match=remedy) as told:
+        download("a/b", {"config.json": 10})
+    assert "logged in" in remedy or "logged in" not in str(told.value)
+
+
+def test_without_a_network_an_agent_comes_from_the_cache(client: Client) -> None:
+    """Before: refused, so that nodes without a network could not load what is on their disk."""
+    fake = client(fails(ConnectionError("unreachable")))
+    shutil.copytree(SHIPPED / AGENT, fake.snapshot)
+    with pytest.warns(UserWarning, match="a/b: the hub cannot be reached, commit c0ffee is taken"):
+        assert from_pretrained("a/b").config.memory == "lru"
+    with pytest.raises(HubError, match="is the network up"):
+        from_pretrained("a/b", revision="v2")
+
+
+def test_a_network_that_fails_on_the_way_leaves_no_file_out(client: Client) -> None:
+    """Before: a README that could not be asked for was passed over like one that is not there."""
+    client(fails(LocalEntryNotFoundError("cannot find it"), "README.md"))
+    with pytest.raises(HubError, match=r"README\.md of a/b: .*is the network up"):
+        download("a/b", {"config.json": 10, "README.md": 10}, ["README.md"])
+
+
+def test_a_damaged_copy_in_the_cache_says_what_to_delete(client: Client) -> None:
+    """Before: the same line at every try, for the hub's client never looks at what it has."""
+    fake = client(lambda name: None)
+    shutil.copytree(SHIPPED / AGENT, fake.snapshot)
+    weights = fake.snapshot / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:500])
+    folder = fake.snapshot.parent.parent
+    with pytest.raises(CheckpointError, match=f"cannot be read.*delete {folder} and fetch it"):
+        from_pretrained("a/b")

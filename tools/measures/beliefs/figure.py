@@ -38,6 +38,8 @@ class Scores(NamedTuple):
     high: Array  # [T]
 
 
+MOST_LEVEL = 10
+"""Letters of the longest of several facts whose names stand level below their bars."""
 OfAgent = Mapping[tuple[str, measure.Source], Scores]
 """By fact and source; an agent without memory has no state."""
 
@@ -173,8 +175,8 @@ def _picture(
     axes[0, 0].set_ylabel("score: 0 a guess, 1 perfect")
     for fact, axis in zip(facts, axes[0, 1:], strict=True):
         plot_steps(scores, fact, axis, colours)
-    figure.suptitle(f"{game}, {style.TWIN_NAMES[twin]}", x=0.01, ha="left")
-    style.legend_above(figure, _legend(scores, colours), 6, "outside upper right")
+    title = f"{game}, {style.TWIN_NAMES[twin]}"
+    style.legend_above(figure, _legend(scores, colours), 6, "outside upper right", title)
     rows = list[dict[str, Any]]()
     for agent, of_agent in scores.items():
         rows += _rows(agent, game, twin, len(agents[agent]), of_agent)
@@ -218,7 +220,9 @@ def plot_bars(scores: Mapping[str, OfAgent], axis: Any, colours: Mapping[str, st
         )
         axis.errorbar(x, score.value, ends, fmt="none", ecolor=style.NEUTRAL, capsize=2, lw=1)
     facts = facts_of(scores)
-    axis.set_xticks(range(len(facts)), facts)
+    is_crowded = len(facts) > 1 and max(map(len, facts)) > MOST_LEVEL
+    turned = {"rotation": 25, "ha": "right", "rotation_mode": "anchor"} if is_crowded else {}
+    axis.set_xticks(range(len(facts)), facts, **turned)
     axis.axhline(0, color=style.NEUTRAL, lw=0.8)
     axis.set_ylim(LOWEST, 1.05)
     axis.set_title("all steps")

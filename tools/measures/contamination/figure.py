@@ -114,8 +114,7 @@ def _picture(
     options: ContaminationOptions,
 ) -> Picture:
     """The figure of one task; strengths, delays and start points are those of one ``seed``."""
-    figure = _figure(agents, seed, options)
-    figure.suptitle(f"{game}, {style.TWIN_NAMES[twin]}", x=0.01, ha="left")
+    figure = _figure(agents, seed, options, f"{game}, {style.TWIN_NAMES[twin]}")
     rows = list[dict[str, Any]]()
     counts = list[int]()
     for agent, measures in agents.items():
@@ -192,7 +191,10 @@ def pool(
 
 
 def _figure(
-    agents: Mapping[str, Measures], first: measure.Contamination, options: ContaminationOptions
+    agents: Mapping[str, Measures],
+    first: measure.Contamination,
+    options: ContaminationOptions,
+    title: str = "",
 ) -> Any:
     """One row a measure, one column a strength of the noise; the dashed line is an agent without
     memory.
@@ -211,7 +213,7 @@ def _figure(
         top.set_title("" if options.shuffle else f"noise sigma = {sigma:g}")
         bottom.set_xlabel(f"steps from the {start}")
     handles, _ = axes[0, 0].get_legend_handles_labels()
-    style.legend_above(figure, handles, 6, "outside upper right")
+    style.legend_above(figure, handles, 6, "outside upper right", title)
     return figure
 
 

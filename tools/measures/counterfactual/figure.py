@@ -132,8 +132,8 @@ def _picture(
         for agent, of_agent in profiles.items():
             rows += _rows(agent, game, twin, len(agents[agent]), title, of_agent)
     handles, _ = axes[0, 0].get_legend_handles_labels()
-    style.legend_above(figure, handles, 6, "outside upper right")
-    figure.suptitle(f"{game}, {style.TWIN_NAMES[twin]}", x=0.01, ha="left")
+    title = f"{game}, {style.TWIN_NAMES[twin]}"
+    style.legend_above(figure, handles, 6, "outside upper right", title)
     return Picture(f"counterfactual-{game}-{twin}", figure, _note(agents, options), rows)
 
 

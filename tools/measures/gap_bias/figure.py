@@ -34,7 +34,7 @@ from arcade_torch.tools.measures.gap_bias.measure import (
     gap_and_bias,
     tasks_out_of_range,
 )
-from arcade_torch.tools.measures.gap_bias.numbered import number_points
+from arcade_torch.tools.measures.gap_bias.numbered import name_points, number_points
 from arcade_torch.tools.measures.gap_bias.paper import PAPER_RETURNS, SEEDS, paper_table
 from arcade_torch.tools.names import agent_names, memory_free
 from arcade_torch.tools.runs import Score
@@ -200,22 +200,18 @@ def plot(rows: Sequence[AgentRow], axis: Any) -> None:
     colours = agent_colours([row.agent for row in rows])
     drawn = list(filter(_has_bias, rows))
     markers = agent_markers([row.agent for row in drawn], colours)
-    is_numbered = len(drawn) > MOST_NAMED
     bars = list[Any]()
     for row in drawn:
         point = (row.bias.value, row.gap.value)
         look = {"fmt": markers[row.agent], "color": colours[row.agent], "capsize": 2, "lw": 1}
         whiskers_of = {"yerr": _whiskers([row.gap]), "xerr": _whiskers([row.bias])}
         bars.append(axis.errorbar(*point, **whiskers_of, **look))
-        if not is_numbered:
-            look_of_name = {"color": colours[row.agent], "fontsize": "small"}
-            axis.annotate(row.agent, point, (6, 5), textcoords="offset points", **look_of_name)
     for line in (axis.axhline, axis.axvline):
         line(0.0, color=NEUTRAL, lw=1, ls="--")
     axis.margins(0.15)
     _widen(axis)
-    if is_numbered:
-        number_points(axis, bars, [row.agent for row in drawn])
+    write_names = number_points if len(drawn) > MOST_NAMED else name_points
+    write_names(axis, bars, [row.agent for row in drawn])
     axis.grid(True, axis="both")
     axis.set_xlabel("Memory Bias\n(MDP - memory-free MDP, normalised return)")
     axis.set_ylabel("Observability Gap\n(MDP - POMDP, normalised return)")

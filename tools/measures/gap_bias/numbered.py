@@ -1,4 +1,6 @@
-"""Points of many agents: a number at each, and a legend beside the panel that names the numbers."""
+"""Names of points: beside each, or of many agents a number at each, and a legend beside the panel
+that names the numbers.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,9 +11,41 @@ LEGEND_LINES = 25
 """Of a column of the legend."""
 _PANEL_PT = np.array((400.0, 300.0))  # about the size of a panel, in points
 _NUMBER_PT = np.array((16.0, 9.0))  # and of a number
+_LETTER_PT = 6.5  # width of a letter of a name
+_LINE_PT = 11.0  # height of a name
+_NAME_FROM_POINT_PT = (6.0, 5.0)
 _DIRECTIONS = 16
 _DISTANCES_PT = (10.0, 15.0, 21.0)  # of a number from its point; the nearer ones come first
 _BARS_ALPHA = 0.35
+
+
+def name_points(axis: Any, bars: Sequence[Any], agents: Sequence[str]) -> None:
+    """Write the names of error bars' points beside them, in a panel whose limits are set; where
+    points lie close, one above the other.
+    """
+    points = np.array([bar.lines[0].get_xydata()[0] for bar in bars]).reshape(-1, 2)
+    x, y = _NAME_FROM_POINT_PT
+    taken = list[tuple[float, float, float]]()
+    for bar, agent, point, place in zip(bars, agents, points, _places(points, axis), strict=True):
+        left = float(place[0]) + x
+        right = left + _LETTER_PT * len(agent)
+        up = 0.0
+        while any(
+            left < other_right
+            and other_left < right
+            and abs(float(place[1]) + up - other_bottom) < _LINE_PT
+            for other_left, other_right, other_bottom in taken
+        ):
+            up += _LINE_PT
+        taken.append((left, right, float(place[1]) + up))
+        axis.annotate(
+            agent,
+            tuple(point),
+            (x, y + up),
+            textcoords="offset points",
+            color=bar.lines[0].get_color(),
+            fontsize="small",
+        )
 
 
 def number_points(axis: Any, bars: Sequence[Any], agents: Sequence[str]) -> None:
@@ -47,8 +81,7 @@ def _offsets(points: np.ndarray[Any, Any], axis: Any) -> list[np.ndarray[Any, An
     """Where the number of each point stands, from the point, so that it is far from all points and
     from the numbers before it.
     """
-    low, high = np.transpose([axis.get_xlim(), axis.get_ylim()])
-    places = (points - low) / (high - low) * _PANEL_PT
+    places = _places(points, axis)
     angles = 2 * np.pi * (np.arange(_DIRECTIONS) + 0.5) / _DIRECTIONS
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     candidates = np.concatenate([distance * circle for distance in _DISTANCES_PT])
@@ -62,3 +95,10 @@ def _offsets(points: np.ndarray[Any, Any], axis: Any) -> list[np.ndarray[Any, An
         offsets.append(candidates[best])
         taken.append(place + candidates[best])
     return offsets
+
+
+def _places(points: np.ndarray[Any, Any], axis: Any) -> np.ndarray[Any, Any]:
+    """Where points stand in their panel, in points of print."""
+    low, high = np.transpose([axis.get_xlim(), axis.get_ylim()])
+    places: np.ndarray[Any, Any] = (points - low) / (high - low) * _PANEL_PT
+    return places
