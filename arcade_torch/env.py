@@ -28,7 +28,7 @@ from arcade_torch.envs_jax.batch import Batch, choose_rows, env_keys
 from arcade_torch.envs_jax.validation import check_fits, check_num_envs
 from arcade_torch.final_observations import FinalObservations
 from arcade_torch.frame_memory import FrameMemory
-from arcade_torch.observability import Observability, partial_flags
+from arcade_torch.observability import Observability, changed_flags, partial_flags
 from arcade_torch.process import check_process
 from arcade_torch.raw_step import Place, RawStep
 from arcade_torch.snapshot import Snapshots
@@ -221,10 +221,9 @@ class ArcadeEnv(BaseEnv):
             observability: ``"full"``, ``"partial"``, or bool [N], true = partial.
 
         Raises:
-            ValueError: Another word or another shape.
-            TypeError: Not a word and not a bool tensor.
+            ValueError: Neither of the words, and not bools of that shape.
         """
-        flags = partial_flags(observability, self.num_envs)
+        flags = changed_flags(observability, self.num_envs)
         wait_for_torch(self.device, self._jax_device)
         self._live.batch = self._live.batch._replace(
             partial=jax.device_put(flags, self._jax_device)

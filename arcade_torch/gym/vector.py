@@ -17,7 +17,7 @@ from arcade_torch.envs_jax.validation import check_choice, check_fits, check_num
 from arcade_torch.gym.batch import Bools, Frames, Info, NumpyBatch, seed_keys
 from arcade_torch.gym.copies import Copyable
 from arcade_torch.gym.env import RENDER_FPS, action_space, check_reset_options, observation_space
-from arcade_torch.observability import Observability, partial_flags
+from arcade_torch.observability import Observability, changed_flags, partial_flags
 
 Rewards = npt.NDArray[np.float64]
 StepResult = tuple[Frames, Rewards, Bools, Bools, Info]
@@ -123,7 +123,7 @@ class ArcadeVectorEnv(Copyable, VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[
         """Change which twins are shown, also in mid-episode; only the frames drawn from now on
         change.
         """
-        self._batch.set_partial(partial_flags(observability, self.num_envs))
+        self._batch.set_partial(changed_flags(observability, self.num_envs))
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None

@@ -163,3 +163,11 @@ def test_a_wrong_state_is_explained_and_not_loaded(state: Any, message: str) -> 
     with pytest.raises(ValueError, match=re.escape(message)):
         env.set_state(state())
     assert (env.get_state() == before).all()
+
+
+def test_none_is_no_twin_to_change_to() -> None:
+    """Before: it was the MDP, though nobody had asked for that."""
+    env = ArcadeEnv(GAME, 3, observability="partial")
+    with pytest.raises(ValueError, match=r"^observability is None, allowed: 'full', 'partial'"):
+        env.set_observability(None)  # type: ignore[arg-type]
+    assert env.observability.all()
