@@ -28,6 +28,7 @@ from arcade_torch.envs_jax.game import Game
 from arcade_torch.envs_jax.mixture import MixedGames, Mixture
 from arcade_torch.envs_jax.validation import (
     Observability,
+    changed_flags,
     check_fits,
     check_num_envs,
     partial_flags,
@@ -226,10 +227,9 @@ class ArcadeEnv(BaseEnv):
             observability: ``"full"``, ``"partial"``, or bool [N], true = partial.
 
         Raises:
-            ValueError: Another word or another shape.
-            TypeError: Not a word and not a bool tensor.
+            ValueError: Neither of the words, and not bools of that shape.
         """
-        flags = partial_flags(observability, self.num_envs)
+        flags = changed_flags(observability, self.num_envs)
         wait_for_torch(self.device, self._jax_device)
         self._live.batch = self._live.batch._replace(
             partial=jax.device_put(flags, self._jax_device)

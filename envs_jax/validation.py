@@ -139,3 +139,12 @@ def partial_flags(
             f"observability is {flags.dtype} {flags.shape}, expected bool ({num_envs},): {_ALLOWED}"
         )
     return flags
+
+
+def changed_flags(observability: Observability, num_envs: int) -> npt.NDArray[np.bool_]:
+    """The flags of running envs whose twin is changed, as :func:`partial_flags` gives them; a
+    ValueError for None too.
+    """
+    if observability is None:
+        raise ValueError(f"observability is None, {_ALLOWED}")
+    return partial_flags(observability, num_envs)

@@ -9,7 +9,7 @@ from gymnasium.error import ResetNeeded
 
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax.batch import env_keys
-from arcade_torch.envs_jax.validation import Observability, partial_flags
+from arcade_torch.envs_jax.validation import Observability, changed_flags, partial_flags
 from arcade_torch.gym.batch import Frames, Info, NumpyBatch
 from arcade_torch.gym.copies import Copyable
 from arcade_torch.gym.window import Window
@@ -101,7 +101,7 @@ class ArcadeGymEnv(Copyable, gymnasium.Env[Frames, int]):
         """Change which twin is shown, also in mid-episode; only the frames drawn from now on
         change.
         """
-        self._batch.set_partial(partial_flags(observability, 1))
+        self._batch.set_partial(changed_flags(observability, 1))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

@@ -15,6 +15,7 @@ from gymnasium.vector.utils import batch_space
 from arcade_torch.compiled import compiled_game
 from arcade_torch.envs_jax.validation import (
     Observability,
+    changed_flags,
     check_choice,
     check_fits,
     check_num_envs,
@@ -128,7 +129,7 @@ class ArcadeVectorEnv(Copyable, VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[
         """Change which twins are shown, also in mid-episode; only the frames drawn from now on
         change.
         """
-        self._batch.set_partial(partial_flags(observability, self.num_envs))
+        self._batch.set_partial(changed_flags(observability, self.num_envs))
 
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None

@@ -126,6 +126,17 @@ def test_a_slice_of_an_episode_starts_from_its_stored_state(kind, burn_in):
     assert not torch.equal(loss(batch)["loss"], found)
 
 
+@pytest.mark.parametrize("kind", ["sequence", "step", "TorchRL"])
+def test_a_burn_in_of_whole_episodes_needs_no_stored_state(kind):
+    network = gru_of_torchrl() if kind == "TorchRL" else toy_network(store=kind)
+    s = stream(3, 8, seed=2, ends=0.3)
+    s.is_init[:, 0] = True
+    s.state.zero_()
+    loss = make_loss(network, burn_in=3)
+    wanted = loss(with_states(s, network))["loss"]
+    torch.testing.assert_close(loss(s.stock().exclude("memory"))["loss"], wanted)
+
+
 def test_a_burn_in_of_memories_that_store_in_two_ways_is_refused():
     towers = (
         toy_network(store="step"),

@@ -83,6 +83,11 @@ def test_the_twin_can_be_chosen(env):
         evaluate(player, observability=twin, seed=3, env=env)
     assert seen["full"] != seen["partial"]
     assert not env.observability.any(), "the environments were lent"
+    env.set_observability("partial")  # as it would be of an agent trained on it
+    player.sums = seen["as it is"] = []
+    evaluate(player, seed=3, env=env)
+    assert seen["as it is"] == seen["partial"] and env.observability.all()
+    env.set_observability("full")
 
 
 def test_numbers_about_the_returns(env):

@@ -314,6 +314,35 @@ def test_padding_is_no_part_of_loss_or_gradient(make, key):
 
 
 @LOSSES
+def test_shuffled_steps_are_refused_between_padding_too(make):
+    batch = padded(ppo_batch(steps=9, ends=0.2), "mask")
+    row = int(batch["mask"].sum(1).argmax())
+    assert batch["mask"][row, :4].all()
+    batch[row, 1:3] = batch[row, 1:3].flip(0)
+    with pytest.raises(ValueError, match=r"must be that of whole sequences, never shuffled"):
+        make()(batch)
+
+
+@LOSSES
+def test_a_step_counts_where_all_masks_say_so(make):
+    """``mask`` of ``split_trajectories``, ``("collector", "mask")`` of a sampler that cuts it."""
+    steps = torch.arange(9)
+    rows = torch.tensor([9, 7, 5, 3])
+    two, one = (ppo_batch(steps=9, ends=0.0) for _ in range(2))
+    two["mask"] = (steps < rows.unsqueeze(1)).unsqueeze(-1)
+    two["collector", "mask"] = (steps < 6).expand(4, -1).unsqueeze(-1)
+    one["mask"] = (steps < rows.clamp_max(6).unsqueeze(1)).unsqueeze(-1)
+    assert torch.equal(value(make(), two), value(make(), one))
+
+
+@LOSSES
+def test_a_batch_may_count_the_steps_of_its_observations_alone(make):
+    other = ppo_batch().exclude(("next", "step_count"))
+    assert "step_count" in other
+    assert torch.equal(value(make(), other), value(make(), ppo_batch()))
+
+
+@LOSSES
 @pytest.mark.parametrize("is_flat", [True, False])
 def test_slices_that_a_sampler_pads_count_as_those_that_it_does_not(make, is_flat):
     losses = []

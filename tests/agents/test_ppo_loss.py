@@ -381,6 +381,17 @@ def test_advantages_are_normalised_and_a_constant_stays_finite():
     assert torch.equal(normalize(torch.full((2, 3), 5.0)), torch.zeros(2, 3))
 
 
+@pytest.mark.parametrize("counted", [0, 1, 2, 20])
+def test_advantages_between_padding_are_normalised_as_if_there_were_none(counted):
+    advantage = torch.randn(4, 5, 1)
+    mask = (torch.randperm(20) < counted).view(4, 5, 1)
+    wanted = torch.zeros(4, 5, 1)
+    if counted:
+        wanted[mask] = normalize(advantage[mask])
+    advantage[~mask] = torch.nan
+    torch.testing.assert_close(normalize(advantage, mask), wanted)
+
+
 def parts_of(loss, batch):
     with torch.no_grad():
         return {key: value.clone() for key, value in loss(batch).items()}
@@ -486,6 +497,7 @@ def test_the_objective_is_a_function_of_tensors_with_the_clips_of_the_paper():
         ratio.log(), old, advantage, value, None, torch.ones(4), torch.tensor(0.2)
     )
     torch.testing.assert_close(unclipped["value_loss"], 0.5 * (value - 1).square())
+    assert not unclipped["value_clipped"].any()
 
 
 def test_a_gradient_step_of_ppo_never_waits_for_the_device():

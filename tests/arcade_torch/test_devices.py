@@ -163,9 +163,13 @@ print(used == {(id(memory), jax.devices()[0]) for memory in (env._memory, env._e
 
 
 def test_an_env_on_the_second_device_leaves_nothing_on_the_first() -> None:
-    """Random keys were drawn, and the mask of a partial step was put, on JAX's default device."""
+    """Random keys were drawn, and the mask of a partial step was put, on JAX's default device.
+
+    Nor is the user told that memory of JAX is read only, which torch does once in a process.
+    """
     code = "from tests.arcade_torch.second_device import main; main()"
     options = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": str(ROOT)}
+    options["PYTHONWARNINGS"] = "error:The given NumPy array is not writable"
     report = json.loads(output_of(code, options))
     assert report["on the second"] > 0
     assert report["left"] == {} and report["programs"] == []

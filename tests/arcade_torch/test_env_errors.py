@@ -176,3 +176,11 @@ def test_a_rollout_fills_what_is_in_out_and_refuses_an_empty_one() -> None:
     env.set_seed(2)
     assert env.rollout(3, break_when_any_done=False, out=pixels) is pixels
     assert not torch.equal(pixels["pixels"], first["pixels"])
+
+
+def test_none_is_no_twin_to_change_to() -> None:
+    """Before: it was the MDP, though nobody had asked for that."""
+    env = ArcadeEnv(GAME, 3, observability="partial")
+    with pytest.raises(ValueError, match=r"^observability is None, allowed: 'full', 'partial'"):
+        env.set_observability(None)  # type: ignore[arg-type]
+    assert env.observability.all()

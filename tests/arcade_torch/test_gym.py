@@ -213,6 +213,19 @@ def test_the_twin_of_a_running_episode_can_be_changed() -> None:
     assert equal(many.step(np.array([3]))[0][0], frames["full"][1])
 
 
+def test_none_is_no_twin_to_change_to() -> None:
+    """Before: it was the MDP, though nobody had asked for that."""
+    one = ArcadeGymEnv("MineSweeperEasy", partial_obs=True)
+    many = ArcadeVectorEnv("MineSweeperEasy", 1, partial_obs=True)
+    for change in (
+        lambda: one.set_observability(None),  # type: ignore[arg-type]
+        lambda: one.reset(options={"observability": None}),
+        lambda: many.set_observability(None),  # type: ignore[arg-type]
+    ):
+        with pytest.raises(ValueError, match=r"^observability is None, allowed: 'full', 'partial'"):
+            change()
+
+
 def test_without_a_seed_np_random_decides_and_with_one_nothing_else() -> None:
     one, two = (ArcadeVectorEnv("MineSweeperEasy", 3) for _ in range(2))
 

@@ -160,6 +160,21 @@ def test_a_nan_in_what_a_step_does_loses_the_rest_of_its_episode_and_nothing_els
     assert torch.equal(o[kept], clean[kept]) and torch.equal(last, clean_last)
 
 
+@pytest.mark.parametrize("where", ["key", "value", "erase", "log_decay"])
+def test_with_stored_states_it_loses_the_states_of_its_episode_too(where):
+    """A replay would store them, and read them as good ones."""
+    steps, start, _ = problem("gated delta", length=12, resets=0.0)
+    start[:, 7] = True
+    stored = torch.randn(2, 12, 3, 4, dtype=torch.float64)
+    clean, clean_states = matrix_scan_stored(steps, start, stored)
+    given = getattr(steps, where).clone()
+    given[0, 3] = torch.nan
+    o, states = matrix_scan_stored(steps._replace(**{where: given}), start, stored)
+    for found, right in ((o, clean), (states.flatten(2), clean_states.flatten(2))):
+        assert found[0, 3:7].isnan().all()
+        assert torch.equal(found[0, 7:], right[0, 7:]) and torch.equal(found[1], right[1])
+
+
 def test_a_nan_in_the_state_does_not_come_through_a_start():
     steps, start, h0 = problem("gated delta", length=9)
     start[:, 0] = True

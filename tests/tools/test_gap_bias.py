@@ -22,7 +22,7 @@ from arcade_torch.tools.measures.bootstrap import (
     resampled,
 )
 from arcade_torch.tools.measures.gap_bias import ScoreOptions, figure
-from arcade_torch.tools.measures.gap_bias.measure import GapBias, game_of, normalise
+from arcade_torch.tools.measures.gap_bias.measure import NUMBERS, GapBias, game_of, normalise
 from arcade_torch.tools.names import memory_free
 from arcade_torch.tools.runs import Score
 from arcade_torch.tools.scores import read_scores
@@ -120,6 +120,30 @@ def test_identical_seeds_give_an_interval_without_width() -> None:
     gap, bias = table.row("lru").gap, table.row("lru").bias
     assert (gap.low, gap.value, gap.high) == pytest.approx((0.1, 0.1, 0.1))
     assert (bias.low, bias.value, bias.high) == pytest.approx((0.1, 0.1, 0.1))
+
+
+def test_a_table_for_a_file_has_every_number_with_its_ends_and_the_game_left_out() -> None:
+    runs = [
+        Score(agent, game, twin, seed, 0.1 * seed + 0.2 * (agent == "lru"))
+        for agent, game, twin, seed in product(
+            ("mlp", "lru"), ("CartPoleEasy", "TetrisEasy"), ("full", "partial"), range(3)
+        )
+    ]
+    table = gap_and_bias(runs, draws=50)
+    of_rows = [(row, "") for row in table.rows]
+    of_rows += [(row, game) for game, rows in table.without.items() for row in rows]
+    for plain, (row, without) in zip(table.table(), of_rows, strict=True):
+        assert (plain["agent"], plain["without"], plain["seeds"]) == (row.agent, without, 3)
+        for name in NUMBERS:
+            found = [plain[name], plain[f"{name}_low"], plain[f"{name}_high"]]
+            np.testing.assert_equal(found, list(getattr(row, name)))
+        np.testing.assert_equal(plain["coverage"], row.coverage)
+
+
+@pytest.mark.parametrize("name", ["confidence", "draws"])
+def test_a_number_of_the_bootstrap_out_of_range_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match=f"^{name} must be .*; got 0"):
+        gap_and_bias([], **{name: 0})
 
 
 def test_gap_and_bias_share_the_resample_of_the_mdp_runs() -> None:
@@ -405,12 +429,19 @@ def test_returns_of_a_game_of_ones_own_outside_of_0_and_1_are_noted(tmp_path: Pa
     rows = [
         f"{memory},{game},{twin},0,finished,default,{value}"
         for memory, twin in product(("lru", "mlp"), ("full", "partial"))
-        for game, value in (("LampEasy-v0", -0.5), ("TetrisEasy-v0", -1.0), ("OwnEasy-v0", 1.0))
+        for game, value in (
+            ("LampEasy-v0", -0.5),
+            ("BulbEasy-v0", 1.5),
+            ("TetrisEasy-v0", -1.0),
+            ("OwnEasy-v0", 1.0),
+        )
     ]
     (tmp_path / "s.csv").write_text("\n".join([head, *rows]))
     made, *_ = figure._table(ScoreOptions(runs=(tmp_path / "s.csv",), draws=10))
     notes = [note for note in made.notes if "outside of [0, 1]" in note]
-    assert len(notes) == 1 and notes[0].startswith("returns of LampEasy-v0 lie outside of [0, 1]")
+    assert len(notes) == 1 and notes[0].startswith(
+        "returns of LampEasy-v0, BulbEasy-v0 lie outside of [0, 1]"
+    )
 
 
 def test_a_bare_name_and_its_version_are_one_game() -> None:

@@ -1,10 +1,20 @@
-"""The interquartile mean, against scipy on the same scores, and its stratified bootstrap."""
+"""The interquartile mean, against scipy on the same scores, its stratified bootstrap, and what an
+interval says.
+"""
 
 import numpy as np
 import pytest
 
 from arcade_torch.tools import gap_and_bias
-from arcade_torch.tools.measures.bootstrap import iqm, resampled
+from arcade_torch.tools.measures.bootstrap import (
+    Interval,
+    iqm,
+    measured_coverage,
+    percentile_interval,
+    pooled,
+    pooled_episodes,
+    resampled,
+)
 from arcade_torch.tools.runs import Score
 
 
@@ -45,3 +55,42 @@ def test_tasks_are_resampled_apart_and_keep_their_seeds() -> None:
     drawn = resampled(cells, 1000, np.random.default_rng(0))
     assert [part.shape for part in drawn] == [(1000, 2), (1000, 3)]
     assert all(set(part.ravel()) == set(cell) for part, cell in zip(drawn, cells, strict=True))
+
+
+def test_an_interval_holds_its_confidence_and_both_ends_belong_to_it() -> None:
+    draws = np.arange(101.0)
+    assert percentile_interval(50, draws, 0.9) == pytest.approx((50, 5, 95))
+    assert percentile_interval(50, draws, 0.5) == pytest.approx((50, 25, 75))
+    for low, high in ((0.0, 0.6), (-0.6, 0.0), (-0.1, 0.1), (np.nan, np.nan)):
+        assert not Interval(0.3, low, high).excludes_zero
+    assert Interval(0.3, 0.1, 0.6).excludes_zero and Interval(-0.3, -0.6, -0.1).excludes_zero
+
+
+def test_a_table_shows_an_interval_where_there_is_one() -> None:
+    nan = float("nan")
+    intervals = [Interval(0.5, 0.25, 0.75), Interval(0.5, nan, nan), Interval(nan, nan, nan)]
+    assert [interval.text() for interval in intervals] == ["0.50 [0.25, 0.75]", "0.50", "-"]
+
+
+def test_a_seed_without_a_value_takes_no_part() -> None:
+    nan = np.nan
+    seeds, mean, low, _ = pooled([[1.0, nan, nan], [3.0, 5.0, nan]])
+    np.testing.assert_array_equal(mean, [2.0, 5.0, nan])
+    np.testing.assert_array_equal(np.isnan(low), [False, True, True])
+    of_episodes = pooled_episodes([[[1.0, nan], [2.0, nan]], [[6.0, 4.0], [nan, nan]]])
+    np.testing.assert_array_equal(of_episodes.seeds, [[1.5, nan], [6.0, 4.0]])
+    np.testing.assert_array_equal(of_episodes.mean, [3.75, 4.0])
+    assert seeds.shape == (2, 3)
+
+
+def test_measured_coverage_is_that_of_studies_played_out_one_by_one() -> None:
+    """Many seeds on the MDP and two on the POMDP: a mean of each counts once, not each seed."""
+    rng = np.random.default_rng(3)
+    held = 0
+    for _ in range(1000):
+        mdp, pomdp = rng.standard_normal(20), rng.standard_normal(2)
+        over_mdp, over_pomdp = (drawn.mean(1) for drawn in resampled([mdp, pomdp], 200, rng))
+        interval = percentile_interval(0.0, over_mdp - over_pomdp, 0.95)
+        held += not interval.excludes_zero
+    measured = measured_coverage((20,), (2,), simulations=1000, draws=200)
+    assert measured == pytest.approx(held / 1000, abs=0.05)

@@ -76,6 +76,12 @@ def test_an_entry_that_lacks_a_game_has_no_rank_and_no_mean() -> None:
     assert set(rows[0].means) == {"full", "partial"} and not rows[1].means
 
 
+def test_entries_without_a_rank_are_listed_by_the_games_they_have() -> None:
+    entries = [listed(name="a", games=QUICK[:1]), listed(name="b", games=QUICK[:2])]
+    rows = ranking(entries, QUICK_SUITE, "100k")
+    assert [(row.listed.entry.name, row.games) for row in rows] == [("b", 2), ("a", 1)]
+
+
 def test_a_single_seed_has_no_interval_and_several_have_one() -> None:
     def score(game: str, twin: str, seed: int) -> float:
         return 0.1 * seed

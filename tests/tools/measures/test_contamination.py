@@ -123,7 +123,7 @@ def test_start_points_lie_before_the_last_frame_and_four_at_most_in_an_episode()
     lengths = np.array(ENV)[found.points[:, 0] % len(ENV)]
     assert (found.points[:, 1] < lengths - 1).all()
     assert np.bincount(found.points[:, 0]).max() <= 4
-    assert len(np.unique(found.points, axis=0)) == 50
+    assert len(np.unique(found.points, axis=0)) == 50 and found.skipped == 0
 
 
 def test_noise_has_the_asked_strength_its_draw_is_shared_and_clipping_keeps_the_range() -> None:
@@ -257,6 +257,8 @@ def test_an_example_wants_two_steps_and_an_episode_that_has_them() -> None:
         ({"sigmas": ()}, "sigmas must be numbers"),
         ({"sigmas": (-1.0,)}, "sigmas must be numbers"),
         ({"delays": (-1,)}, "delays must be whole numbers"),
+        ({"delays": ()}, "delays must be whole numbers"),
+        ({"delays": (0.5,)}, "delays must be whole numbers"),
         ({"starts": 0}, "starts must be at least 1"),
     ],
 )

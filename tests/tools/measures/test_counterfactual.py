@@ -352,6 +352,8 @@ def test_frames_come_from_the_same_step_of_the_episode_and_short_donors_are_miss
     policy = linear_policy(0.9, dtype=torch.float32)
     found = counterfactual(policy, ToyEnv([2, 4, 4, 9]), episodes=4, donors=2)
     assert found.dropped == 1 and found.lengths.tolist() == [4, 4, 9]
+    shortest = counterfactual(policy, ToyEnv([2, 3, 3]), episodes=3, donors=1)
+    assert shortest.dropped == 1 and shortest.lengths.tolist() == [3, 3]
     counts = np.isfinite(found.flip).sum(-1)
     assert counts[0, :4].tolist() == [2, 2, 2, 2] and not counts[0, 4:].any()
     assert counts[2].tolist() == [0, 0, 0, 0, 0, 2, 2, 2, 2]

@@ -190,3 +190,16 @@ def test_outputs_that_are_no_numbers_are_refused(measure: str, late: bool) -> No
         return
     with pytest.raises(ValueError, match=r"^the policy's outputs must be numbers, got NaN"):
         MEASURES[measure](policy)
+
+
+@pytest.mark.parametrize("feedback", [False, True])
+def test_a_noisy_frame_that_gives_no_numbers_is_refused(feedback: bool) -> None:
+    """Before, with feedback: the decision on the first noisy frame counted as another one."""
+    policy = Policy(
+        lambda o: o.float().flatten(-3)[..., :ACTIONS].sqrt(),  # noise goes below 0
+        lambda features, action, is_init, state: (features, state),
+    )
+    with pytest.raises(ValueError, match=r"^the policy's outputs must be numbers, got NaN"):
+        contamination(
+            policy, ToyEnv([14]), sigmas=(30.0,), delays=(0,), starts=1, feedback=feedback
+        )

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
-from arcade_torch.tools import recall_density, saliency
+from arcade_torch.tools import Policy, recall_density, saliency
 from arcade_torch.tools.measures.recall_density.measure import (
     binned,
     density_of_windows,
@@ -65,6 +65,24 @@ def test_reference_lines_are_those_of_uniform_memory_and_of_none() -> None:
     assert no_memory([7], 16)[-2:].sum() < 1  # one of 7 frames is longer than two of 16 bins
 
 
+def test_options_are_those_of_the_windows_that_it_plays() -> None:
+    net = Net("mingru", torch.float32)
+    policy = Policy(net.encode, net.remember, net.initial_state)
+    for options in (
+        {"norm": "l2sq", "reduce": "sum"},
+        {"norm": "l2", "target": "probs"},
+        {"end": "random", "cap": 5},
+    ):
+        found = recall_density(policy, ToyEnv([9, 12]), episodes=5, seed=2, **options)  # type: ignore[arg-type]
+        of_play = {name: options.pop(name) for name in ("end", "cap") if name in options}
+        windows = list(greedy_windows(policy, ToyEnv([9, 12]), episodes=5, seed=2, **of_play))  # type: ignore[arg-type]
+        wanted = density_of_windows(policy, windows, **options)  # type: ignore[arg-type]
+        assert [share.size for share in found.shares] == [window.n + 1 for window in windows]
+        np.testing.assert_allclose(found.deltas, wanted.deltas, rtol=1e-6)
+        np.testing.assert_allclose(found.sizes, wanted.sizes, rtol=1e-6)
+        assert found.target == wanted.target
+
+
 def test_short_trajectories_are_dropped_and_counted() -> None:
     found = recall_density(RHO, ToyEnv([1, 2, 3, 30]), episodes=8, seed=1)
     assert found.dropped == 4 and sorted(set(found.lengths.tolist())) == [3, 30]
@@ -114,6 +132,8 @@ def test_a_window_gives_the_shares_of_its_saliency() -> None:
         one = density_of_windows(net, [w], norm=norm, reduce=reduce)  # type: ignore[arg-type]
         two = saliency(net, w.frames, w.last_action, w.is_init, norm=norm, reduce=reduce)  # type: ignore[arg-type]
         np.testing.assert_allclose(one.shares[0], two.shares(), rtol=1e-4, atol=1e-9)
+        assert one.sizes[0] == pytest.approx(two.per_frame.sum(), rel=1e-4)
+        assert one.certainty[0] == pytest.approx(two.output.max(), rel=1e-4)
 
 
 @pytest.mark.parametrize(("algorithm", "target"), [("pqn", "q"), ("ppo", "probs"), ("dqn", "q")])

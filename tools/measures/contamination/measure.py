@@ -426,19 +426,16 @@ def replayed(
     ``changed`` on.
     """
     count = features.shape[0]
-    begin = changed + 1
+    # Up to the first difference nothing has been chosen by the replay yet: the recorded actions
+    # lead there.
+    begin = changed + 1 if feedback else features.shape[1]
     state: Any = policy.initial_state(1) if window.state is None else window.state
     if state is not None:
         state = state.expand(count, *state.shape[1:]).clone()
     actions = window.last_action.expand(count, *window.last_action.shape)
     starts = window.is_init.bool().expand(count, -1)
-    if not feedback:
-        out = policy.remember(features, actions, starts, state)[0]
-        refuse_nan(out)
-        return out
-    # Up to the first difference nothing has been chosen by the replay yet: the recorded actions
-    # lead there.
     out, state = policy.remember(features[:, :begin], actions[:, :begin], starts[:, :begin], state)
+    refuse_nan(out)
     parts = [out]
     for t in range(begin, features.shape[1]):
         action = policy.greedy(out[:, -1:])
