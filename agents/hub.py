@@ -60,7 +60,7 @@ def download(
     commit = revision
     for name, most_bytes in files.items():
         try:
-            file = _fetch(hub, repo, name, commit, most_bytes)
+            file, commit = _fetch(hub, repo, name, commit, most_bytes)
         except HubError:
             raise
         except Exception as error:
@@ -72,21 +72,23 @@ def download(
                 continue
             raise _refused(repo, name, error) from error
         folder = file.parents[name.count("/")]
-        commit = folder.name
     if folder is None:
         raise HubError(f"{repo} holds none of {', '.join(files)}")
     return folder
 
 
-def _fetch(hub: Any, repo: str, name: str, commit: str | None, most_bytes: int) -> Path:
-    """A file of a repository, in the cache, if it is no larger than that."""
-    about = hub.get_hf_file_metadata(hub.hf_hub_url(repo, name, revision=commit))
+def _fetch(
+    hub: Any, repo: str, name: str, revision: str | None, most_bytes: int
+) -> tuple[Path, str | None]:
+    """A file of a repository, in the cache, if it is no larger than that; and its commit."""
+    about = hub.get_hf_file_metadata(hub.hf_hub_url(repo, name, revision=revision))
     if about.size is None or about.size > most_bytes:
         raise HubError(
             f"{name} of {repo} has {about.size or 'an unknown number of'} bytes, at most "
             f"{most_bytes:,} are fetched"
         )
-    return Path(hub.hf_hub_download(repo, name, revision=about.commit_hash or commit))
+    commit = about.commit_hash or revision
+    return Path(hub.hf_hub_download(repo, name, revision=commit)), commit
 
 
 def _cached(
