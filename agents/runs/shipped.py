@@ -41,6 +41,11 @@ def agents_hint(folder: Path) -> str:
     names = pretrained_names()
     near = difflib.get_close_matches(folder.name, names, n=1)
     hint = f"did you mean {near[0]!r}? " if near else ""
+    if len(folder.parts) == 2 and not folder.parent.exists():
+        hint += (
+            "an agent of that name on the Hugging Face hub is fetched first, arcade-torch pull "
+            f"{folder}; "
+        )
     return (
         f"{hint}give a run folder, one of its checkpoints, an agent that was shared, or one of "
         f"this package: {', '.join(names)}"

@@ -396,7 +396,10 @@ def test_a_csv_file_with_one_run_a_line_is_read(tmp_path: Path) -> None:
             "two scores for mlp",
         ),
         ("agent,game,observability,seed,score\nlru,X,full,0,1\n", "memory-free agent 'mlp'"),
-        ("agent,game,observability,seed,score\nmlp,X,full,0,1\n", "nothing to compare yet"),
+        (
+            "agent,game,observability,seed,score\nmlp,X,full,0,1\n",
+            "on both twins, and gap and bias compare",
+        ),
         ("agent,game,observability,seed,score\nmlp,X,half,0,1\n", "full or partial"),
         ("agent,game,observability,seed,score\nmlp,X,full,0,nan\n", "is nan"),
     ],

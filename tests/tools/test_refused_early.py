@@ -12,6 +12,11 @@ from arcade_torch.tools.errors import is_told, one_line
 ROOT = Path(__file__).resolve().parents[2]
 MISSING = [
     ("evaluate nosuch", "nosuch is not a folder; give a run folder"),
+    (
+        "evaluate someone/agent",
+        "someone/agent is not a folder; an agent of that name on the Hugging Face hub is fetched "
+        "first, arcade-torch pull someone/agent; give a run folder",
+    ),
     ("push nosuch someone/agent", "nosuch is not a folder; give a run folder"),
     ("analyze saliency nosuch", "nosuch does not exist"),
     ("figure returns --runs nosuch", "nosuch does not exist"),

@@ -198,7 +198,7 @@ def gap_and_bias(
     tasks = [game for game in games if _is_complete(game, cells, baselines)]
     if not tasks:
         raise ValueError(
-            "no task has finished runs of every agent on both twins: nothing to compare yet"
+            "no task has finished runs of every agent on both twins, and gap and bias compare them"
         )
     rows, values = _rows(cells, baselines, tasks, draws, confidence, seed, iqm=True)
     return GapBias(
