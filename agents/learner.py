@@ -220,25 +220,44 @@ class FusedRAdam(torch.optim.Adam):
     @torch.no_grad()
     def step(self, closure: Any = None) -> Any:
         """One step, as :meth:`torch.optim.Optimizer.step`."""
+        loss = None if closure is None else torch.enable_grad()(closure)()
         group = self.param_groups[0]
+        parameters = group["params"]
+        # those that had a gradient equally often: all, but for parts that some steps do not use
+        together: dict[int, list[nn.Parameter]] = {}
+        for parameter in parameters:
+            if parameter.grad is not None:
+                steps = int(self.state.get(parameter, {}).get("step", 0))
+                together.setdefault(steps + 1, []).append(parameter)
+        try:
+            for t, weights in together.items():
+                group["params"] = weights
+                self._step_number(t, group)
+        finally:
+            group["params"] = parameters
+        return loss
+
+    def _step_number(self, t: int, group: dict[str, Any]) -> None:
+        """The step ``t`` of all weights of a group."""
         lr = group["lr"]
         eps = group["eps"]
         (beta1, beta2) = group["betas"]
-        t = 1 + int(next((state["step"] for state in self.state.values()), 0))
         largest = 2 / (1 - beta2) - 1
         correction = 1 - beta2**t
         # of the average of squares: what the variance is known by
         length = largest - 2 * t * beta2**t / correction
         factor = (length - 4) * (length - 2) * largest / ((largest - 4) * (largest - 2) * length)
-        group["lr"] = lr * math.sqrt(factor) if length > 5 else 0.0  # 0: only the averages move
-        group["eps"] = eps / math.sqrt(correction)
-        result = super().step(closure)
-        group["lr"] = lr
-        group["eps"] = eps
+        try:
+            group["lr"] = lr * math.sqrt(factor) if length > 5 else 0.0  # 0: only averages move
+            group["eps"] = eps / math.sqrt(correction)
+            super().step()
+        finally:
+            group["lr"] = lr
+            group["eps"] = eps
         if length <= 5:
-            for parameter, state in self.state.items():
-                parameter.add_(state["exp_avg"], alpha=-lr / (1 - beta1**t))
-        return result
+            for parameter in group["params"]:
+                average = self.state[parameter]["exp_avg"]
+                parameter.add_(average, alpha=-lr / (1 - beta1**t))
 
 
 def set_learning_rate(optimizer: torch.optim.Optimizer, learning_rate: float) -> None:

@@ -199,3 +199,21 @@ def test_the_fused_radam_is_torchs_radam(dtype):
         plain.step()
         for x, y in zip(ours, theirs, strict=True):
             torch.testing.assert_close(x, y, **tolerance)
+
+
+def test_radam_in_one_pass_moves_a_weight_that_has_a_gradient_now_and_then_as_torch_does() -> None:
+    """A part of a network that is used in some steps alone has fewer steps than the others."""
+    ours = [torch.nn.Parameter(torch.linspace(-1, 1, 5)) for _ in range(3)]
+    theirs = [torch.nn.Parameter(p.detach().clone()) for p in ours]
+    fused, plain = make_optimizer(ours, 1e-2), torch.optim.RAdam(theirs, lr=1e-2)
+    generator = torch.Generator().manual_seed(0)
+    for step in range(20):
+        used = [number for number in range(3) if step % (number + 1) == number]
+        for number in range(3):
+            gradient = torch.randn(5, generator=generator) if number in used else None
+            for parameters in (ours, theirs):
+                parameters[number].grad = None if gradient is None else gradient.clone()
+        fused.step()
+        plain.step()
+        for a, b in zip(ours, theirs, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
