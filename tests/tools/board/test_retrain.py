@@ -13,12 +13,17 @@ from arcade_torch.tools.board.entry import EntryRefusedError
 from tests.tools.board.boards import SHORT, plain_entry
 
 
+def train_twins(folder: Path) -> None:
+    """A run of a few frames on each twin."""
+    for twin in ("full", "partial"):
+        config = preset("smoke", env="CartPoleEasy-v0", observability=twin, seed=3, threads=1)
+        train(config, folder / twin)
+
+
 def test_a_run_that_is_trained_again_from_its_entry_has_the_same_weights_and_scores(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for twin in ("full", "partial"):
-        config = preset("smoke", env="CartPoleEasy-v0", observability=twin, seed=3, threads=1)
-        train(config, tmp_path / "first" / twin)
+    train_twins(tmp_path / "first")
     file = tmp_path / "entry.json"
     plain = plain_entry(tmp_path / "first")
     file.write_text(json.dumps(plain))
@@ -33,9 +38,7 @@ def test_a_run_that_is_trained_again_from_its_entry_has_the_same_weights_and_sco
 def test_a_run_that_is_trained_elsewhere_is_compared_by_its_score_and_decides_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for twin in ("full", "partial"):
-        config = preset("smoke", env="CartPoleEasy-v0", observability=twin, seed=3, threads=1)
-        train(config, tmp_path / "runs" / twin)
+    train_twins(tmp_path / "runs")
     plain = plain_entry(tmp_path / "runs")
     plain["made_with"] |= {"commit": "0123456789ab", "processor": "another one"}
     for run in plain["runs"]:

@@ -226,16 +226,13 @@ def _widen(axis: Any) -> None:
 
 def plot_bars(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
     """Draw one number of every agent, one of `PANELS`, as a bar with its interval."""
-    rows_with_number = list(filter(_has_bias, rows)) if name == "bias" else rows
-    agents = [row.agent for row in rows_with_number]
-    intervals = [getattr(row, name) for row in rows_with_number]
-    colours = agent_colours([row.agent for row in rows])
+    agents, intervals, colours = _numbers(rows, name)
     places = range(len(agents))
     axis.bar(
         places,
         [interval.value for interval in intervals],
         0.72,
-        color=[colours[agent] for agent in agents],
+        color=colours,
         yerr=_whiskers(intervals),
         error_kw={"lw": 1},
         capsize=3,
@@ -249,16 +246,13 @@ def plot_bars(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
 
 def plot_lines(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
     """The same of many agents in a narrow panel: a line each, with its interval."""
-    colours = agent_colours([row.agent for row in rows])
-    rows = list(filter(_has_bias, rows)) if name == "bias" else rows
-    agents = [row.agent for row in rows]
-    intervals = [getattr(row, name) for row in rows]
+    agents, intervals, colours = _numbers(rows, name)
     places = range(len(agents))
     axis.barh(
         places,
         [interval.value for interval in intervals],
         0.72,
-        color=[colours[agent] for agent in agents],
+        color=colours,
         xerr=_whiskers(intervals),
         error_kw={"lw": 1},
     )
@@ -266,6 +260,15 @@ def plot_lines(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
     axis.set_ylim(len(agents) - 0.5, -0.5)
     axis.set(title=PANELS[name][0], xlabel=PANELS[name][1])
     axis.axvline(0.0, color=NEUTRAL, lw=1)
+
+
+def _numbers(rows: Sequence[AgentRow], name: str) -> tuple[list[str], list[Interval], list[str]]:
+    """The agents that have a number, its intervals, and the agents' colours."""
+    colours = agent_colours([row.agent for row in rows])
+    with_number = list(filter(_has_bias, rows)) if name == "bias" else rows
+    agents = [row.agent for row in with_number]
+    intervals = [getattr(row, name) for row in with_number]
+    return agents, intervals, [colours[agent] for agent in agents]
 
 
 def _whiskers(intervals: Sequence[Interval]) -> Any:
