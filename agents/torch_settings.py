@@ -1,11 +1,20 @@
 """The settings of torch that a run computes under, whatever the process or the caller has set."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from typing import Any
 
 import torch
 
-__all__ = ["plain_torch"]
+from arcade_torch.models.generators import ONE_AT_A_TIME
+
+__all__ = ["given_back", "plain_torch"]
+
+Found = dict[Callable[[Any], object], Any]
+"""What sets a setting of the process -> its value before."""
+
+_FOUND: list[Found] = []
+"""What the runs in this process found, in the order in which they began."""
 
 
 @contextmanager
@@ -32,3 +41,37 @@ def plain_torch() -> Iterator[None]:
             stack.callback(torch.set_default_dtype, dtype)
             torch.set_default_dtype(torch.float32)
         yield
+
+
+@contextmanager
+def given_back(found: Found) -> Iterator[None]:
+    """In the end settings that belong to the whole process are as they were found.
+
+    A run that ends while a later one, in another thread, goes on leaves them to that one, and hands
+    on what it found.
+
+    Args:
+        found: what sets a setting -> its value before.
+
+    Example:
+        >>> threads = torch.get_num_threads()
+        >>> with given_back({torch.set_num_threads: threads}):
+        ...     torch.set_num_threads(threads + 1)
+        >>> torch.get_num_threads() == threads
+        True
+    """
+    with ONE_AT_A_TIME:
+        _FOUND.append(found)
+    try:
+        yield
+    finally:
+        with ONE_AT_A_TIME:
+            place = next(i for i, other in enumerate(_FOUND) if other is found)
+            later = _FOUND[place + 1 :]
+            del _FOUND[place]
+            for set_back, value in found.items():
+                heir = next((other for other in later if set_back in other), None)
+                if heir is None:
+                    set_back(value)
+                else:
+                    heir[set_back] = value

@@ -9,7 +9,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from arcade_torch.agents.runs.checkpoint import load_latest, save_checkpoint
 from arcade_torch.agents.runs.files import CsvLog, list_checkpoints, read_csv, write_json
 from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS, RunFolder, RunFolderError
 from arcade_torch.agents.runs.loggers import RunLogger, check_logger
-from arcade_torch.agents.torch_settings import plain_torch
+from arcade_torch.agents.torch_settings import given_back, plain_torch
 from arcade_torch.agents.trainer import Trainer
 from arcade_torch.envs_jax.registry import games_of, is_mixture, resolve_id
 from arcade_torch.models.generators import ONE_AT_A_TIME
@@ -285,13 +285,14 @@ def result_from(path: Path, final: Mapping[str, Any]) -> TrainResult:
 @contextmanager
 def own_settings(config: TrainConfig) -> Iterator[None]:
     """Seed torch's global generators and set its threads and settings for the duration of a run."""
-    threads = torch.get_num_threads()
-    try:
-        torch.set_num_threads(config.threads or threads)
-        with plain_torch(), own_random_numbers(torch.device(config.device), config.seed):
-            yield
-    finally:
-        torch.set_num_threads(threads)
+    with ExitStack() as stack:
+        with ONE_AT_A_TIME:
+            threads = torch.get_num_threads()
+            stack.enter_context(given_back({torch.set_num_threads: threads}))
+            torch.set_num_threads(config.threads or threads)
+        stack.enter_context(plain_torch())
+        stack.enter_context(own_random_numbers(torch.device(config.device), config.seed))
+        yield
 
 
 @contextmanager
@@ -304,16 +305,13 @@ def own_random_numbers(device: torch.device, seed: int) -> Iterator[None]:
         torch.cuda.init()
         index = torch.cuda.current_device() if device.index is None else device.index
         generators.append(torch.cuda.default_generators[index])
-    with ONE_AT_A_TIME:
-        states = [generator.get_state() for generator in generators]
-        for generator in generators:
-            generator.manual_seed(seed)
-    try:
-        yield
-    finally:
+    with ExitStack() as stack:
         with ONE_AT_A_TIME:
-            for generator, state in zip(generators, states, strict=True):
-                generator.set_state(state)
+            states = {generator.set_state: generator.get_state() for generator in generators}
+            stack.enter_context(given_back(states))
+            for generator in generators:
+                generator.manual_seed(seed)
+        yield
 
 
 @contextmanager
