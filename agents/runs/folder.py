@@ -2,7 +2,6 @@
 
 import contextlib
 import importlib.metadata
-import os
 import platform
 import shlex
 import sys
@@ -17,7 +16,13 @@ import arcade_torch
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.differences import differing_fields
 from arcade_torch.agents.runs.checkpoint import FORMAT, refuse_format, remove_draft_checkpoints
-from arcade_torch.agents.runs.files import is_final, read_json, remove_drafts, write_json
+from arcade_torch.agents.runs.files import (
+    check_writable_folder,
+    is_final,
+    read_json,
+    remove_drafts,
+    write_json,
+)
 
 METRIC_COLUMNS = (
     "frames", "updates", "grad_steps", "seconds", "fps",
@@ -76,13 +81,10 @@ class RunFolder:
                 "pass resume=True (--resume) to continue it, or " if self._config.is_file() else ""
             )
             raise RunFolderError(f"{self.path} is not empty; {hint}choose another folder")
-        existing = next(
-            path for path in (self.path, *self.path.absolute().parents) if path.exists()
-        )
-        if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
-            raise RunFolderError(
-                f"cannot write to {self.path}: {existing} is not a writable folder"
-            )
+        try:
+            check_writable_folder(self.path.absolute(), self.path)
+        except OSError as error:
+            raise RunFolderError(f"cannot write to {self.path}: {error.strerror}") from error
 
     @contextlib.contextmanager
     def claim(self, config: TrainConfig) -> Iterator[None]:

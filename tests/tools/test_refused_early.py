@@ -1,12 +1,16 @@
 """Refusals that need nothing heavy come before it is imported, and say what helps."""
 
 import errno
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from arcade_torch.agents.runs import files
+from arcade_torch.tools import cli
+from arcade_torch.tools.bench import registry
 from arcade_torch.tools.errors import is_told, one_line
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -62,3 +66,33 @@ def test_a_file_that_grows_too_large_is_no_full_disk() -> None:
     said = one_line(OSError(errno.EFBIG, "File too large", "x.pdf"))
     limit = "a file may not grow so large here: raise the limit with ulimit -f"
     assert said == f"could not write x.pdf: File too large; {limit}"
+
+
+@pytest.mark.parametrize(
+    ("number", "code"), [(errno.EROFS, cli.EXIT_FAILED), (errno.EACCES, cli.EXIT_BAD_INPUT)]
+)
+@pytest.mark.parametrize(
+    "words",
+    [
+        "train --preset smoke --env SignpostEasy --out OUT",
+        "list sheet --out OUT.png",
+        "bench memory lru --out OUT.csv",
+        "bench all --benches memory --out OUT.json",
+    ],
+)
+def test_a_place_that_cannot_be_written_has_one_exit_code_with_all_commands(
+    words: str,
+    number: int,
+    code: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Before: 2 from train on a read-only disk and 1 from the others; bench measured first."""
+    monkeypatch.setattr(os, "access", lambda *args, **kwargs: False)
+    monkeypatch.setattr(files, "_is_read_only", lambda place: number == errno.EROFS)
+    monkeypatch.setattr(registry, "measure", None)
+    assert cli.main(words.replace("OUT", str(tmp_path / "out")).split()) == code
+    said = capsys.readouterr().err
+    assert os.strerror(number) in said and said.count("\n") == 1
+    assert not os.listdir(tmp_path)

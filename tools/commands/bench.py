@@ -8,7 +8,7 @@ from typing import Any, Literal
 import tyro
 
 from arcade_torch.agents.checked import require
-from arcade_torch.agents.runs.files import write_atomic, write_json
+from arcade_torch.agents.runs.files import check_writable, write_atomic, write_json
 from arcade_torch.tools.bench import registry
 from arcade_torch.tools.files import Table, format_value, write_csv
 from arcade_torch.tools.options import Command
@@ -45,6 +45,8 @@ class Bench(Command):
             str(out),
             f"a file that ends in {' or '.join(endings)}",
         )
+        if out is not None:
+            check_writable(out)
         results = registry.measure({self.name: self.options}, "one", _log)
         results["machine"] |= {name: about[name] for name in ("env", "device") if name in about}
         for name, table in results["tables"].items():
@@ -92,6 +94,9 @@ class BenchAll(Command):
     def run(self) -> int:
         """Measure and save."""
         require(self.out.suffix == ".json", "--out", str(self.out), "a file that ends in .json")
+        page = self.page or self.out.with_suffix(".md")
+        for file in (self.out, page):
+            check_writable(file)
         sizes = registry.SIZES[self.size]
         options: dict[str, Any] = {
             name: registry.module_of(name).Options(**sizes.get(name, {}), out=None)
@@ -99,7 +104,7 @@ class BenchAll(Command):
         }
         results = registry.measure(options, self.size, _log)
         say(write_json(self.out, results))
-        say(write_atomic(self.page or self.out.with_suffix(".md"), registry.page(results)))
+        say(write_atomic(page, registry.page(results)))
         return 0
 
 
