@@ -1,6 +1,8 @@
 """The training benchmark: rates fit together, shares add up, and wrong options get one line."""
 
 import csv
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -90,3 +92,13 @@ def test_wrong_options_get_one_line(
     assert cli.main(["bench", "train", *words]) == cli.EXIT_BAD_INPUT
     err = capsys.readouterr().err
     assert said in err and err.count("\n") == 1
+
+
+def test_the_profiler_writes_no_lines_of_its_own() -> None:
+    """Before: USDT:... SyncActivityProfilerHandler.cpp:52] profiler_start, among ours."""
+    source = (
+        "import torch; from arcade_torch.tools.bench.harness import op_breakdown\n"
+        "print(sum(op_breakdown(lambda: torch.ones(9) + 1).values()))"
+    )
+    ran = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=True)
+    assert float(ran.stdout) == pytest.approx(1) and not ran.stderr

@@ -4,6 +4,7 @@ Measures take turns, so that a slow minute of the machine hits all of them alike
 torch's, which waits for the device.
 """
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from statistics import median
@@ -104,6 +105,8 @@ def op_breakdown(work: Callable[[], object]) -> dict[str, float]:
     On a CPU the profiler's own memory makes copies look a little dearer than they are.
     """
     work()
+    # else the first profiler of a process writes lines of its own to stderr
+    os.environ.setdefault("KINETO_LOG_LEVEL", "99")
     with profile() as run:
         work()
     events = list(run.key_averages())

@@ -10,15 +10,30 @@ LEAST = -103.3
 
 
 def refuse_nan(out: Tensor) -> None:
-    """Refuse outputs that are no numbers: NaN is the best action of any comparison.
+    """Refuse outputs that are no numbers: NaN and infinity are the best action of any comparison.
 
     Raises:
-        ValueError: one of them is NaN.
+        ValueError: one of them is NaN, or infinity; minus infinity is an action that is masked out.
     """
-    if bool(out.isnan().any()):
+    wrong = out.isnan() | (out == torch.inf)
+    if bool(wrong.any()):
+        got = "NaN" if bool(out.isnan().any()) else "infinity, where minus infinity is a mask"
         raise ValueError(
-            "the policy's outputs must be numbers, got NaN: its weights may hold some, or it "
+            f"the policy's outputs must be numbers, got {got}: its weights may hold some, or it "
             "cannot read noisy pixels (clip=True keeps them in their range)"
+        )
+
+
+def refuse_no_action(values: Tensor) -> None:
+    """Refuse outputs of actions [A] that are all masked out.
+
+    Raises:
+        ValueError: they are.
+    """
+    if not bool(values.isfinite().any()):
+        raise ValueError(
+            "the policy must allow an action at the decision that is explained, got minus infinity "
+            f"for all: all of its {len(values)} actions are masked out"
         )
 
 

@@ -192,6 +192,34 @@ def test_outputs_that_are_no_numbers_are_refused(measure: str, late: bool) -> No
         MEASURES[measure](policy)
 
 
+@pytest.mark.parametrize("measure", MEASURES)
+def test_an_infinite_output_is_refused(measure: str) -> None:
+    """Before: it counted as masked out, though it is the best action of all frames."""
+    causal = linear_policy(0.5, dtype=torch.float32)
+
+    def remember(features: Tensor, *rest: Any) -> tuple[Tensor, Any]:
+        out, state = causal.remember(features, *rest)
+        return out + torch.tensor([0.0, torch.inf, 0.0])[: out.shape[-1]], state
+
+    policy = Policy(causal.encode, remember, causal.initial_state)
+    with pytest.raises(ValueError, match=r"^the policy's outputs must be numbers, got infinity"):
+        MEASURES[measure](policy)
+
+
+@pytest.mark.parametrize("reduce", ["per_action", "sum"])
+def test_a_decision_without_an_action_is_refused(reduce: Any) -> None:
+    """Before: an error of torch about an empty list, or a trajectory without any gradient."""
+    causal = linear_policy(0.5, dtype=torch.float32)
+
+    def remember(features: Tensor, *rest: Any) -> tuple[Tensor, Any]:
+        out, state = causal.remember(features, *rest)
+        return out - torch.inf, state
+
+    policy = Policy(causal.encode, remember, causal.initial_state)
+    with pytest.raises(ValueError, match="all of its 3 actions are masked out"):
+        saliency(policy, window(6).frames, reduce=reduce)
+
+
 @pytest.mark.parametrize("feedback", [False, True])
 def test_a_noisy_frame_that_gives_no_numbers_is_refused(feedback: bool) -> None:
     """Before, with feedback: the decision on the first noisy frame counted as another one."""

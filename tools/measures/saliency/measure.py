@@ -24,7 +24,7 @@ from torch import Tensor
 from arcade_torch.agents.checked import require
 from arcade_torch.tools.measures.frames import as_array, channel_axis, float_type
 from arcade_torch.tools.measures.keys import Names
-from arcade_torch.tools.measures.masked import refuse_nan
+from arcade_torch.tools.measures.masked import refuse_nan, refuse_no_action
 from arcade_torch.tools.measures.policy import (
     Policy,
     Progress,
@@ -197,6 +197,7 @@ def _decided(
     """The outputs [A] of a decision, and their Jacobian [K, T, E] by the features [T, E]."""
     values = decide(features)
     refuse_nan(values)
+    refuse_no_action(values)
     jacobian = _jacobian(values, features, reduce)
     if reduce == "per_action":  # a sum over actions may rightly not change
         refuse_cuts(decide, features, jacobian.ne(0).any(-1).any(0))
