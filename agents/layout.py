@@ -25,6 +25,7 @@ from arcade_torch.agents.batch_checks import (
     is_stock,
     step_mask,
 )
+from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.rollout_buffer import final_key
@@ -38,7 +39,7 @@ class NetworkInputs:
     def __init__(self, network: TensorDictModuleBase) -> None:
         if not hasattr(network, "in_keys"):
             raise TypeError(
-                f"a network must be a TensorDict module; got a {type(network).__name__}: "
+                f"a network must be a TensorDict module; got {kind_of(network)}: "
                 "TensorDictModule(network, [what it reads], [what it writes])"
             )
         check_state_keys(network)

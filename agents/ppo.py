@@ -33,6 +33,7 @@ from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.network_loss import NetworkLoss
 from arcade_torch.agents.policy import make_actor
 from arcade_torch.agents.returns import SequenceGAE
+from arcade_torch.envs_jax.validation import kind_of
 
 
 def ppo_objective(
@@ -185,7 +186,7 @@ class PPOLoss(NetworkLoss):
         if not hasattr(actor_network, "get_dist"):
             raise TypeError(
                 "actor_network must be a probabilistic TensorDict module, such as a "
-                f"ProbabilisticActor; got a {type(actor_network).__name__} (of an "
+                f"ProbabilisticActor; got {kind_of(actor_network)} (of an "
                 "ActorValueOperator: get_policy_operator(), get_value_operator())"
             )
         if critic_network is None:

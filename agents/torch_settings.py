@@ -8,13 +8,13 @@ import torch
 
 from arcade_torch.models.generators import ONE_AT_A_TIME
 
-__all__ = ["given_back", "plain_torch"]
+__all__ = ["Settings", "given_back", "plain_torch"]
 
-Found = dict[Callable[[Any], object], Any]
+Settings = dict[Callable[[Any], object], Any]
 """What sets a setting of the process -> its value before."""
 
-_FOUND: list[Found] = []
-"""What the runs in this process found, in the order in which they began."""
+_OPEN: list[Settings] = []
+"""What the runs in this process have to give back, in the order in which they began."""
 
 
 @contextmanager
@@ -44,14 +44,14 @@ def plain_torch() -> Iterator[None]:
 
 
 @contextmanager
-def given_back(found: Found) -> Iterator[None]:
+def given_back(settings: Settings) -> Iterator[None]:
     """In the end settings that belong to the whole process are as they were found.
 
-    A run that ends while a later one, in another thread, goes on leaves them to that one, and hands
-    on what it found.
+    A run that ends while a later one, in another thread, goes on leaves them to that one, with
+    the values to give back.
 
     Args:
-        found: what sets a setting -> its value before.
+        settings: what sets a setting -> its value before.
 
     Example:
         >>> threads = torch.get_num_threads()
@@ -61,15 +61,15 @@ def given_back(found: Found) -> Iterator[None]:
         True
     """
     with ONE_AT_A_TIME:
-        _FOUND.append(found)
+        _OPEN.append(settings)
     try:
         yield
     finally:
         with ONE_AT_A_TIME:
-            place = next(i for i, other in enumerate(_FOUND) if other is found)
-            later = _FOUND[place + 1 :]
-            del _FOUND[place]
-            for set_back, value in found.items():
+            place = next(i for i, other in enumerate(_OPEN) if other is settings)
+            later = _OPEN[place + 1 :]
+            del _OPEN[place]
+            for set_back, value in settings.items():
                 heir = next((other for other in later if set_back in other), None)
                 if heir is None:
                     set_back(value)

@@ -26,7 +26,7 @@ from arcade_torch.agents.runs.checkpoint import load_latest, save_checkpoint
 from arcade_torch.agents.runs.files import CsvLog, list_checkpoints, read_csv, write_json
 from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS, RunFolder, RunFolderError
 from arcade_torch.agents.runs.loggers import RunLogger, check_logger
-from arcade_torch.agents.torch_settings import given_back, plain_torch
+from arcade_torch.agents.torch_settings import Settings, given_back, plain_torch
 from arcade_torch.agents.trainer import Trainer
 from arcade_torch.envs_jax.registry import games_of, is_mixture, resolve_id
 from arcade_torch.models.generators import ONE_AT_A_TIME
@@ -307,7 +307,9 @@ def own_random_numbers(device: torch.device, seed: int) -> Iterator[None]:
         generators.append(torch.cuda.default_generators[index])
     with ExitStack() as stack:
         with ONE_AT_A_TIME:
-            states = {generator.set_state: generator.get_state() for generator in generators}
+            states: Settings = {
+                generator.set_state: generator.get_state() for generator in generators
+            }
             stack.enter_context(given_back(states))
             for generator in generators:
                 generator.manual_seed(seed)

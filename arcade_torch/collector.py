@@ -17,6 +17,7 @@ from arcade_torch.collector_arguments import check_arguments
 from arcade_torch.compiled import TERMINATED, TRUNCATED
 from arcade_torch.dlpack import is_host, to_torch
 from arcade_torch.env import ArcadeEnv
+from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.jax_env import JaxEnv
 from arcade_torch.policies import (
     ROOT_KEYS,
@@ -385,9 +386,7 @@ class ArcadeCollector(BaseCollector):
         if policy_or_weights is None or policy_or_weights is self.policy:
             return
         if not isinstance(self.policy, nn.Module):
-            raise TypeError(
-                f"the policy is a {type(self.policy).__name__}, which has no weights to update"
-            )
+            raise TypeError(f"the policy is {kind_of(self.policy)}, which has no weights to update")
         copy_weights(self.policy, policy_or_weights)
 
     def state_dict(self) -> OrderedDict[str, Any]:

@@ -5,6 +5,7 @@ from collections.abc import Collection
 from typing import Any, get_args
 
 from arcade_torch.env import ArcadeEnv
+from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.jax_env import JaxEnv
 from arcade_torch.rollout_buffer import FinalFrames
 
@@ -25,7 +26,7 @@ def check_arguments(
     """Raise TypeError or ValueError for what cannot work, before anything is allocated."""
     if not isinstance(env, ArcadeEnv | JaxEnv):
         raise TypeError(
-            f"env is a {type(env).__name__}, expected an ArcadeEnv or what from_jax gives; others "
+            f"env is {kind_of(env)}, expected an ArcadeEnv or what from_jax gives; others "
             "go with torchrl's Collector, a function that makes one is called first"
         )
     if isinstance(env, ArcadeEnv) and env.one_hot:
@@ -34,7 +35,7 @@ def check_arguments(
         )
     if policy is not None and not callable(policy):
         raise TypeError(
-            f"policy is a {type(policy).__name__}, expected a TensorDictModule, a callable, or "
+            f"policy is {kind_of(policy)}, expected a TensorDictModule, a callable, or "
             "None for random actions"
         )
     tensors = [str(key) for key in env.observation_keys if key in _parameters(policy)]

@@ -460,7 +460,7 @@ def _leaf_names(obs: Any, obs_key: str | None) -> list[Any]:
     is_array = len(leaves) == 1 and not leaves[0][0]
     paths = [tuple(jax.tree_util.keystr((key,), simple=True) for key in path) for path, _ in leaves]
     if obs_key is not None and (not isinstance(obs_key, str) or not obs_key):
-        raise TypeError(f"obs_key is {obs_key!r}, expected a string")
+        raise TypeError(f"obs_key is {obs_key!r}, expected a name")
     if is_array:
         array = leaves[0][1]
         is_picture = array.dtype == np.uint8 and array.ndim == 4
@@ -472,6 +472,11 @@ def _leaf_names(obs: Any, obs_key: str | None) -> list[Any]:
             "obs_key out"
         )
     for path in paths:
+        if "" in path:
+            raise ValueError(
+                "the observation has an entry with an empty name, for which TorchRL has no specs: "
+                "give it a name"
+            )
         if path[0] in _OWN_KEYS:
             raise ValueError(
                 f"the observation has an entry {path[0]!r}, which is a key of the env itself: "

@@ -12,6 +12,8 @@ from torchrl.data import Bounded, Categorical, TensorSpec
 from torchrl.envs import TensorDictPrimer
 from torchrl.modules.utils import get_primers_from_module
 
+from arcade_torch.envs_jax.validation import kind_of
+
 Policy = Callable[[TensorDictBase], TensorDictBase]
 # beside the observation; task: if there are several
 ROOT_KEYS = ("last_action", "is_init", "step_count", "episode_reward", "task")
@@ -148,7 +150,7 @@ class PolicyRunner:
 
 def _refuse_output(given: Any) -> NoReturn:
     """Say what a policy has to give in the place of what it gave."""
-    kind = f"a {type(given).__name__}"
+    kind = kind_of(given)
     if isinstance(given, TensorDictBase):
         kind = f"{', '.join(map(str, given.keys()))}, but no 'action'"
     raise TypeError(

@@ -21,6 +21,7 @@ from arcade_torch.dlpack import to_torch
 from arcade_torch.envs_jax import registered_ids
 from arcade_torch.envs_jax.batch import Batch, BatchedGame
 from arcade_torch.envs_jax.settings import is_key
+from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.validation import check_tensor
 
 # flags that snapshots of version 0.2.0 lack: no episode of theirs has ended
@@ -177,7 +178,7 @@ class TreeSnapshots:
     def check_batch(self, td: Any) -> None:
         """Refuse, with TypeError or ValueError, what is no such TensorDict."""
         if not isinstance(td, TensorDictBase):
-            raise TypeError(f"the state is a {type(td).__name__}: pass what get_state() gave")
+            raise TypeError(f"the state is {kind_of(td)}: pass what get_state() gave")
         if td.batch_size != (self._num_envs,):
             raise ValueError(
                 f"the state is of batch size {list(td.batch_size)}, this env has {self._num_envs} "

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from arcade_torch import validation
 from arcade_torch.envs_jax.settings import is_key
 from arcade_torch.envs_jax.tracing import ContractError, check_same, leaves, traced
+from arcade_torch.envs_jax.validation import kind_of
 
 # names that params and envs of the suites have for a time limit
 _LIMITS = ("max_steps_in_episode", "max_timesteps", "max_steps")
@@ -212,4 +213,4 @@ def name_of(env: Any) -> str:
 def described(value: Any) -> str:
     """A result in a message: its kind, of a tuple also how many things it holds."""
     size = f" of {len(value)}" if isinstance(value, tuple) else ""
-    return f"a {type(value).__name__}{size}"
+    return f"{kind_of(value)}{size}"

@@ -8,6 +8,7 @@ import torch
 from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
 from arcade_torch import validation
+from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.suite import Suite, described, name_of
 
 _INTEGERS = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
@@ -84,7 +85,7 @@ def _check_spec(spec: TensorSpec, num_envs: int) -> None:
     is_categorical = type(spec) is Categorical
     if not is_categorical and not isinstance(spec, Bounded | Unbounded):
         raise TypeError(
-            f"action_spec is a {type(spec).__name__}, expected Categorical or Bounded; several "
+            f"action_spec is {kind_of(spec)}, expected Categorical or Bounded; several "
             f"choices at once are Bounded(0, n - 1, shape=({num_envs}, k), dtype=torch.int64)"
         )
     if spec.dtype not in (_INTEGERS if is_categorical else _INTEGERS + _FLOATS):

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 
-from arcade_torch.envs_jax.validation import format_value, plain
+from arcade_torch.envs_jax.validation import format_value, kind_of, plain
 from arcade_torch.process import warn
 
 # integers of torch: the type of numpy under which negative numbers are large
@@ -45,9 +45,7 @@ def check_tensordict(td: Any, num_envs: int) -> None:
     ``_step``.
     """
     if not isinstance(td, TensorDictBase):
-        raise TypeError(
-            f"got a {type(td).__name__}, expected a TensorDict of batch size [{num_envs}]"
-        )
+        raise TypeError(f"got {kind_of(td)}, expected a TensorDict of batch size [{num_envs}]")
     if td.batch_size != (num_envs,):
         raise ValueError(
             f"the tensordict has batch_size {list(td.batch_size)}, expected [{num_envs}], one row "
@@ -56,7 +54,7 @@ def check_tensordict(td: Any, num_envs: int) -> None:
     following = td.get("next", None)
     if following is not None and not isinstance(following, TensorDictBase):
         raise TypeError(
-            f"entry 'next' is a {type(following).__name__}, expected a TensorDict: leave it out"
+            f"entry 'next' is {kind_of(following)}, expected a TensorDict: leave it out"
         )
     if "_step" in td:
         steps = mask(td, "_step", num_envs)
@@ -80,7 +78,7 @@ def tensor(td: TensorDictBase, key: str) -> torch.Tensor:
 def check_tensor(value: Any, name: str) -> None:
     """Raise TypeError unless ``value``, called ``name``, is a dense tensor."""
     if not isinstance(value, torch.Tensor):
-        raise TypeError(f"{name} is a {type(value).__name__}, expected a tensor")
+        raise TypeError(f"{name} is {kind_of(value)}, expected a tensor")
     if value.layout is not torch.strided:
         raise TypeError(
             f"{name} is a {value.layout} tensor, expected a dense one: pass .to_dense()"

@@ -13,6 +13,7 @@ import numpy.typing as npt
 from arcade_torch.envs_jax.game import MEMORY_KINDS, NUM_ACTIONS, ORACLES, Game, keeps_ends
 from arcade_torch.envs_jax.settings import compiled
 from arcade_torch.envs_jax.tracing import check_array, check_same, leaves, traced
+from arcade_torch.envs_jax.validation import kind_of
 
 _OURS = "arcade_torch.envs_jax."
 _STEPS_TO_PLAY = 100  # a running episode is played to its end
@@ -52,11 +53,7 @@ def check_game(game: Game[Any], play: bool = False) -> None:
         raise ValueError(f"{name}: reset gives None, wanted a state: a tree of arrays")
     stepped = traced(name, "step", game.step, key, first, jax.ShapeDtypeStruct((), jnp.int32))
     if not isinstance(stepped, tuple) or len(stepped) != 4:
-        got = (
-            f"{len(stepped)} values"
-            if isinstance(stepped, tuple)
-            else f"a {type(stepped).__name__}"
-        )
+        got = f"{len(stepped)} values" if isinstance(stepped, tuple) else kind_of(stepped)
         raise ValueError(
             f"{name}: step gives {got}, wanted 4: state, reward, terminated, truncated (a tuple)"
         )
@@ -75,7 +72,7 @@ def _check_facts(name: str, facts: Any) -> None:
     """Refuse facts that are no dictionary of arrays of booleans, integers or float32."""
     if not isinstance(facts, dict):
         raise ValueError(
-            f"{name}: facts gives a {type(facts).__name__}, wanted a dictionary of arrays by name"
+            f"{name}: facts gives {kind_of(facts)}, wanted a dictionary of arrays by name"
         )
     for fact, value in facts.items():
         if not isinstance(fact, str) or not fact or "." in fact:
@@ -181,7 +178,7 @@ def check_made(game: Any, full_id: str, obs_size: int) -> None:
     contract.
     """
     if not isinstance(game, Game):
-        raise ValueError(f"the factory of {full_id} made a {type(game).__name__}, wanted a Game")
+        raise ValueError(f"the factory of {full_id} made {kind_of(game)}, wanted a Game")
     if (game.id, game.obs_size) != (full_id, obs_size):
         arrived = f"{game.id!r} with obs_size {game.obs_size!r}"
         raise ValueError(

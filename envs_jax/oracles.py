@@ -18,7 +18,7 @@ import numpy.typing as npt
 from arcade_torch.envs_jax.batch import Batch, BatchedGame, env_keys
 from arcade_torch.envs_jax.game import NUM_ACTIONS, ORACLES, Game, check_ends
 from arcade_torch.envs_jax.settings import as_numpy
-from arcade_torch.envs_jax.validation import check_choice, format_value
+from arcade_torch.envs_jax.validation import check_choice, format_value, kind_of
 
 Kind = Literal["state", "frames"]
 Actions = npt.NDArray[np.int32]
@@ -110,7 +110,7 @@ def make_oracle(game: Game[Any], kind: Kind = "state") -> Player:
     player: Player = game.oracles[kind](game)
     if not callable(getattr(player, "act", None)):
         raise ValueError(
-            f"{game.id}: the {kind} oracle is a {type(player).__name__}, wanted a player with "
+            f"{game.id}: the {kind} oracle is {kind_of(player)}, wanted a player with "
             "act(seen, is_init)"
         )
     return player

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 
 from arcade_torch.envs_jax.settings import as_numpy
+from arcade_torch.envs_jax.validation import kind_of, with_article
 
 _ADDRESS = re.compile("0x[0-9a-f]+")  # of a Python object; another one at every tracing
 _OURS = __name__.partition(".")[0]
@@ -102,9 +103,7 @@ def _is_equal(one: Any, other: Any) -> bool:
 def check_array(name: str, subject: str, value: Any, shape: tuple[int, ...], dtype: str) -> None:
     """Raise ValueError for anything but an array of this shape and type."""
     if not hasattr(value, "shape"):
-        raise ValueError(
-            f"{name}: {subject} a {type(value).__name__}, wanted {dtype} {list(shape)}"
-        )
+        raise ValueError(f"{name}: {subject} {kind_of(value)}, wanted {dtype} {list(shape)}")
     if tuple(value.shape) != shape or str(value.dtype) != dtype:
         raise ValueError(
             f"{name}: {subject} {value.dtype} {list(value.shape)}, wanted {dtype} {list(shape)}"
@@ -118,12 +117,12 @@ def check_same(name: str, subject: str, first: Any, following: Any) -> None:
     ours = leaves(first, subject)
     theirs = leaves(following, subject)
     if not ours:
-        raise ValueError(f"{name}: reset gives {_article(subject)} without any array")
+        raise ValueError(f"{name}: reset gives {with_article(subject)} without any array")
     before: object = jax.tree.structure(first)
     if before != jax.tree.structure(following):
-        kind = "an array" if hasattr(first, "dtype") else f"a {type(first).__name__}"
+        kind = "an array" if hasattr(first, "dtype") else f"{kind_of(first)}"
         raise ValueError(
-            f"{name}: step gives {_article(subject)} of another structure, with "
+            f"{name}: step gives {with_article(subject)} of another structure, with "
             f"{', '.join(theirs) or 'nothing'}; wanted that of "
             f"reset, {kind} with {', '.join(ours)}"
         )
@@ -131,11 +130,6 @@ def check_same(name: str, subject: str, first: Any, following: Any) -> None:
         place = subject if leaf == subject else f"{subject} entry {leaf}"
         given = theirs[leaf]
         check_array(name, f"step gives {place} as", given, tuple(wanted.shape), str(wanted.dtype))
-
-
-def _article(noun: str) -> str:
-    """The noun with a or an."""
-    return f"an {noun}" if noun[0] in "aeiou" else f"a {noun}"
 
 
 def leaves(tree: Any, subject: str) -> dict[str, Any]:

@@ -21,6 +21,28 @@ def format_value(value: Any) -> str:
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]}... ({len(text)} characters)"
 
 
+def with_article(noun: str) -> str:
+    """A noun with a or an, as it is said.
+
+    Example:
+        >>> [with_article(noun) for noun in ("int", "uint8", "LSTM", "OneHot", "dict")]
+        ['an int', 'a uint8', 'an LSTM', 'a OneHot', 'a dict']
+    """
+    vowels = "AEFHILMNORSX" if noun[:2].isupper() else "AEIO"
+    is_vowel = noun[:1].upper() in vowels and noun[:3].lower() != "one"
+    return f"an {noun}" if is_vowel or noun[:2].lower() == "un" else f"a {noun}"
+
+
+def kind_of(value: object) -> str:
+    """The type of a value, as a message names it.
+
+    Example:
+        >>> kind_of(3), kind_of({})
+        ('an int', 'a dict')
+    """
+    return with_article(type(value).__name__)
+
+
 def plain(value: Any) -> Any:
     """A number or a bool of numpy, torch or JAX as one of Python; anything else as it is.
 

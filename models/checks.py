@@ -51,7 +51,7 @@ def check_memory(
     Raises:
         MemoryLawError: a law is broken; says which, by how much, and what usually causes it.
         ValueError, TypeError: the input size is not known, or ``dtype`` is none of the four; there
-            is no ``initial_state``.
+            is no ``initial_state``, or a part is quantised.
 
     Example:
         >>> from arcade_torch.models import check_memory, make_memory
@@ -93,7 +93,8 @@ def law_results(
         breaks it.
 
     Raises:
-        ValueError, TypeError: the input size is not known; there is no ``initial_state``.
+        ValueError, TypeError: the input size is not known; there is no ``initial_state``, or a part
+            is quantised.
 
     Example:
         >>> from arcade_torch.models import make_memory

@@ -104,6 +104,13 @@ def subject_of(
         raise TypeError(
             f"{type(module).__name__} has no initial_state(batch_size), which gives a TensorDict"
         )
+    for name, part in module.named_modules():
+        if type(part).__module__.startswith("torch.ao.nn.quantized"):
+            raise TypeError(
+                f"{name or 'it'} of {type(module).__name__} is quantised, and rounds what it reads "
+                "by the largest entry of a call, so that no law holds: check it before it is "
+                "quantised"
+            )
     if dtype not in TOLERANCES:
         allowed = ", ".join(map(str, TOLERANCES))
         raise ValueError(f"dtype is {dtype}, allowed: {allowed}")

@@ -255,7 +255,7 @@ def first_state(memory: nn.Module, batch_size: int | Sequence[int]) -> TensorDic
     state = memory.initial_state(batch_size)  # type: ignore[operator]
     if not isinstance(state, TensorDictBase):
         raise TypeError(
-            f"initial_state of {name} gives a {type(state).__name__}, and not a TensorDict: "
+            f"initial_state of {name} gives no TensorDict, but {type(state).__name__}: "
             'TensorDict({"h": ...}, batch_size=[batch_size])'
         )
     return state

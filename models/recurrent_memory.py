@@ -239,7 +239,7 @@ class RecurrentMemory(Memory):
             if type(out) is tuple:
                 kind = f"({', '.join(type(part).__name__ for part in out)})"
             raise TypeError(
-                f"{self._name} gives a {kind} and not (y, state) with a tensor y: say how it is "
+                f"{self._name} gives {kind} and not (y, state) with a tensor y: say how it is "
                 "run with run=lambda module, x, state: ..."
             )
         y, after = out
@@ -258,7 +258,7 @@ class RecurrentMemory(Memory):
         for leaf in tensors.values():
             if not isinstance(leaf, Tensor):
                 raise TypeError(
-                    f"the state of {self._name} holds a {type(leaf).__name__}, and not tensors "
+                    f"the state of {self._name} holds {type(leaf).__name__}, and not tensors "
                     "alone, in tuples, lists or dictionaries: convert it in run="
                 )
         return tensors
@@ -282,10 +282,23 @@ class RecurrentMemory(Memory):
             of_none, _ = self._try(copy_of(tried), x, None)
             of_zeros, _ = self._try(copy_of(tried), x, zeros)
             if not torch.allclose(of_none, of_zeros, equal_nan=True):
+                self._refuse_kept_state(tried, x)
                 raise ValueError(
                     f"{self._name} begins with something else than zeros, or learns what it begins "
                     "with: say what with start=lambda module, batch_size: ..."
                 )
+
+    def _refuse_kept_state(self, module: nn.Module, x: Tensor) -> None:
+        """Raise ValueError if a module that is given None goes on from its call before."""
+        again = copy_of(module)
+        first, _ = self._try(again, x, None)
+        second, _ = self._try(again, x, None)
+        if not torch.allclose(first, second, equal_nan=True):
+            raise ValueError(
+                f"two equal calls of {self._name} differ, both with the state None: it keeps its "
+                "state in itself, or draws random numbers; what it carries on belongs into the "
+                "state that it returns, and None is where an episode begins"
+            )
 
 
 def _call(module: nn.Module, x: Tensor, state: Any) -> tuple[Tensor, Any]:

@@ -10,6 +10,8 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from arcade_torch.envs_jax.validation import kind_of
+
 LARGEST = 2**63
 _MOMENTS = {"step", "exp_avg", "exp_avg_sq"}
 
@@ -97,7 +99,7 @@ def _described(value: Any) -> str:
     if isinstance(value, Tensor):
         return f"a tensor {str(value.dtype).removeprefix('torch.')} {list(value.shape)}"
     if isinstance(value, Mapping | list | tuple):
-        return f"a {type(value).__name__} of {len(value)}"
+        return f"{kind_of(value)} of {len(value)}"
     if isinstance(value, str):
         return repr(value[:40])
     if (
@@ -106,7 +108,7 @@ def _described(value: Any) -> str:
         or (isinstance(value, int) and abs(value) < LARGEST)
     ):
         return repr(value)
-    return f"a {type(value).__name__}"
+    return kind_of(value)
 
 
 def _require(fits: bool, name: str, saved: Any, allowed: str) -> None:

@@ -669,7 +669,7 @@ def test_a_collector_that_was_shut_down_says_so() -> None:
             ValueError,
             "final_frames is 'some', allowed: 'all', 'truncated', 'none'",
         ),
-        ({"policy": 3}, TypeError, "policy is a int, expected a TensorDictModule"),
+        ({"policy": 3}, TypeError, "policy is an int, expected a TensorDictModule"),
         (
             {"policy": lambda pixels: pixels},
             TypeError,

@@ -364,3 +364,19 @@ def test_one_hot_actions_are_refused_when_the_env_is_made() -> None:
         from_jax(Walk(), num_envs=2, action_spec=OneHot(3, shape=(2, 3)))
     with pytest.raises(ValueError, match=r"action_spec has shape \[3\], expected \[2, ...\]"):
         from_jax(Walk(), num_envs=2, action_spec=Categorical(3, shape=(3,)))
+
+
+@pytest.mark.parametrize("entry", [{"": jnp.zeros(2)}, {"a": {"": jnp.zeros(2)}}])
+def test_an_observation_entry_without_a_name_is_refused(entry: Any) -> None:
+    """Before: TorchRL's collector stopped with 'NoneType' object is not iterable."""
+
+    class Unnamed:
+        def reset(self, key: jax.Array) -> Any:
+            return {"b": jnp.zeros(1), **entry}, jnp.int32(0)
+
+        def step(self, key: jax.Array, state: Any, action: jax.Array) -> Any:
+            return {"b": jnp.zeros(1), **entry}, state + 1, 0.0, state >= 2, {}
+
+    spec = Categorical(3, shape=(2,))
+    with pytest.raises(ValueError, match=r"an entry with an empty name.*give it a name"):
+        from_jax(Unnamed(), num_envs=2, action_spec=spec)

@@ -84,6 +84,6 @@ def test_bad_questions_are_refused():
 def test_an_oracle_that_is_no_player_is_refused_in_one_line():
     game = make("SignpostEasy")
     game.oracles = {"state": lambda game: 1}
-    message = "SignpostEasy-v0: the state oracle is a int, wanted a player with act"
+    message = "SignpostEasy-v0: the state oracle is an int, wanted a player with act"
     with pytest.raises(ValueError, match=message):
         make_oracle(game, "state")

@@ -1,12 +1,15 @@
 """check_memory passes lawful modules of anybody's, and names the law that a broken one breaks."""
 
+import warnings
+
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
 
-from arcade_torch.models.checks import MemoryLawError, check_memory
+from arcade_torch.models.checks import MemoryLawError, check_memory, law_results
 from arcade_torch.models.mingru import MinGRU
+from arcade_torch.models.recurrent_memory import RecurrentMemory
 from arcade_torch.models.registry import make_memory, memory_names
 
 
@@ -340,3 +343,16 @@ def test_a_wrong_gradient_is_found_in_float32():
 def test_a_type_that_is_no_floating_one_is_refused():
     with pytest.raises(ValueError, match=r"dtype is torch\.int64, allowed: torch\.float64"):
         check_memory(LeakyAverage(), dtype=torch.int64)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_a_quantised_module_is_refused_in_one_line(dtype):
+    """Before: 'expected scalar type Float but found Double', or rounding as a broken law."""
+    memory = RecurrentMemory(nn.GRU(3, 4), 3, 4)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        quantised = torch.ao.quantization.quantize_dynamic(memory, {nn.GRU}, dtype=torch.qint8)
+    with pytest.raises(TypeError, match=r"module of RecurrentMemory is quantised.*check it before"):
+        check_memory(quantised, dtype=dtype)
+    with pytest.raises(TypeError, match="is quantised"):
+        law_results(quantised)

@@ -413,6 +413,22 @@ class BeginsWithOnes(nn.Module):
         return x + h[:, None], h
 
 
+class KeepsItsState(nn.Module):
+    """Goes on from the call before when it is given None."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gru = nn.GRU(D, H, batch_first=True)
+        self.h: Tensor | None = None
+
+    def forward(self, x: Tensor, state: Any = None) -> tuple[Tensor, Tensor]:
+        before = self.h if state is None else state
+        if before is not None and before.shape[1] != len(x):
+            before = None
+        y, self.h = self.gru(x, before)
+        return y, self.h
+
+
 class Inside(nn.Module):
     """Does not say that time is the first axis of what is in it."""
 
@@ -450,11 +466,11 @@ def one_of_batch(module: nn.Module, batch_size: int) -> Tensor:
         (
             lambda: RecurrentMemory(nn.Linear(D, H), D, H, run=lambda m, x, s: m(x)),
             TypeError,
-            r"gives a Tensor and not \(y, state\)",
+            r"gives Tensor and not \(y, state\)",
         ),
         (lambda: RecurrentMemory(Grows(), D, D), ValueError, "after one step.*window of fixed"),
         (lambda: RecurrentMemory(OneForAll(), D, D), ValueError, "has to be the batch"),
-        (lambda: RecurrentMemory(Counts(), D, D), TypeError, "holds a int.*run="),
+        (lambda: RecurrentMemory(Counts(), D, D), TypeError, "holds int, and not tensors.*run="),
         (lambda: RecurrentMemory(BeginsWithOnes(), D, D), ValueError, "than zeros.*start=lambda"),
         (
             lambda: RecurrentMemory(nn.GRU(D, H), D, H, start=one_of_batch),
@@ -466,6 +482,11 @@ def one_of_batch(module: nn.Module, batch_size: int) -> Tensor:
         (lambda: RecurrentMemory(nn.LazyLinear(H), D, H), TypeError, "no shape before the first"),
         (lambda: RecurrentMemory(nn.GRUCell(D, H), D, H), TypeError, r"run= with a loop over x\."),
         (lambda: RecurrentMemory(Cell(), D, H), ValueError, r"run= with a loop over x\.unbind"),
+        (
+            lambda: RecurrentMemory(KeepsItsState(), D, H),
+            ValueError,
+            "two equal calls of KeepsItsState differ.*keeps its state in itself",
+        ),
         (lambda: RecurrentMemory(Inside(), D, H), ValueError, "whatever the batch.*time for its"),
         (
             lambda: RecurrentMemory(nn.GRU(D, H), D, H, start=torch.zeros),
@@ -480,7 +501,7 @@ def one_of_batch(module: nn.Module, batch_size: int) -> Tensor:
         (
             lambda: RecurrentMemory(nn.Linear(D, D), D, D, run=run_with_more),
             TypeError,
-            r"gives a \(Tensor, NoneType, dict\) and not \(y, state\)",
+            r"gives \(Tensor, NoneType, dict\) and not \(y, state\)",
         ),
         (
             lambda: RecurrentMemory(nn.Linear(D, D), D, D, run=run_by_rows),

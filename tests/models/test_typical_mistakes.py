@@ -460,5 +460,5 @@ def test_a_module_that_is_no_memory_is_refused_where_it_is_handed_over(use: Any)
     """Before: an AttributeError from within, or a network with a tuple for a state."""
     with pytest.raises(TypeError, match=r"LSTM has no initial_state\(batch_size\).*own_memory"):
         use(nn.LSTM(3, WIDTH))
-    with pytest.raises(TypeError, match="TupleState gives a tuple, and not a TensorDict"):
+    with pytest.raises(TypeError, match="TupleState gives no TensorDict, but tuple"):
         use(TupleState())

@@ -11,7 +11,7 @@ from arcade_torch.tools.cards.study import FRAMES, GAMES, SEEDS
 from arcade_torch.tools.imports import is_from_user
 from arcade_torch.tools.options import Command, at_least, command_line
 from arcade_torch.tools.progress import Bars
-from arcade_torch.tools.text import say
+from arcade_torch.tools.text import counted, say
 
 
 @dataclass
@@ -110,7 +110,7 @@ class Card(Command):
         definition = card_study(name, self.frames, self.games, self.seeds)
         check_memories_of(definition)
         root = self.out / f"{name}-study"
-        say(f"{len(definition.runs())} runs of {self.frames:,} frames, in {root}")
+        say(f"{counted(len(definition.runs()), 'run')} of {self.frames:,} frames, in {root}")
         command = command_line(["card", *self.argv])
         result = study(definition, root, make_engine("auto", self.workers), command=command)
         for run, reason in result.errors.items():

@@ -15,7 +15,7 @@ from arcade_torch.tools.studies.budget import FEWEST_FRAMES, Budget, Size, measu
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study, compare_study
 from arcade_torch.tools.studies.runner import make_engine, planned
-from arcade_torch.tools.text import say, warn
+from arcade_torch.tools.text import counted, say, warn
 
 GAMES = ("SignpostEasy", "MineSweeperEasy", "CountRecallEasy")
 """A probe that nobody plays without memory, and two of the ten games."""
@@ -121,5 +121,5 @@ def _described(study: Study) -> str:
     runs = len(study.runs())
     return (
         f"{subject} against {', '.join(others)} on {', '.join(study.games)}, as MDP and POMDP, "
-        f"{len(study.seeds)} seeds of {study.total_frames or 0:,} frames: {runs} runs"
+        f"{counted(len(study.seeds), 'seed')} of {study.total_frames or 0:,} frames: {runs} runs"
     )

@@ -7,7 +7,7 @@ import tyro
 
 from arcade_torch.agents.runs.files import check_writable
 from arcade_torch.tools.options import Command, at_least
-from arcade_torch.tools.text import say
+from arcade_torch.tools.text import counted, say
 
 
 @dataclass
@@ -48,7 +48,7 @@ class Submit(Command):
         words = Words(self.name, self.url, self.commit, self.note, self._checkpoints())
         entry = submit(self.runs, words, self.memory, self.seeds, progress=say_progress)
         write_entry(file, entry)
-        say(f"{len(entry.runs)} runs, {entry.frames:,} frames each: {file}")
+        say(f"{counted(len(entry.runs), 'run')}, {entry.frames:,} frames each: {file}")
         return 0
 
     def _checkpoints(self) -> dict[str, str]:

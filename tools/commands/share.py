@@ -11,7 +11,7 @@ from arcade_torch.agents.runs.files import check_writable_folder, read_bytes
 from arcade_torch.agents.runs.shipped import agent_folder
 from arcade_torch.tools.imports import existing_agent, import_again
 from arcade_torch.tools.options import Command, at_least
-from arcade_torch.tools.text import say
+from arcade_torch.tools.text import counted, say
 
 MOST_EXTRA = 64 * 2**20
 """Bytes of the largest film, page or table of results that is fetched."""
@@ -58,7 +58,7 @@ class Push(Command):
             place = str(folder)
             if not into_folder:
                 place = hub.upload(folder, self.repo, self.message, self.private)
-        say(f"mean return {results['mean_reward']:.3f} over {self.episodes} episodes")
+        say(f"mean return {results['mean_reward']:.3f} over {counted(self.episodes, 'episode')}")
         say(f"sha256 {results['sha256']['model.safetensors']}")
         say(f"pushed: {place}")
         if into_folder:

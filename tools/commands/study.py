@@ -18,7 +18,7 @@ from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, demo_study, st
 from arcade_torch.tools.studies.processes import Processes
 from arcade_torch.tools.studies.runner import DiskFullError, make_engine, planned, study
 from arcade_torch.tools.studies.shards import part_of
-from arcade_torch.tools.text import say
+from arcade_torch.tools.text import counted, say
 
 
 class Resumable(Command):
@@ -138,7 +138,7 @@ class StudyCommand(Resumable):
                 frames = config.num_updates * config.learner.frames_per_update
                 total += frames
                 say(f"{run.name}  {frames:,} frames")
-            print(f"{len(plan):,} runs, {total:,} frames in all", file=sys.stderr)
+            print(f"{counted(len(plan), 'run')}, {total:,} frames in all", file=sys.stderr)
             return 0
         if self.check_memory:
             check_memories_of(definition)

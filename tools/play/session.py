@@ -18,6 +18,7 @@ from arcade_torch.envs_jax import ACTION_NAMES, Game
 from arcade_torch.envs_jax.registry import is_mixture
 from arcade_torch.gym.batch import NumpyBatch, seed_keys
 from arcade_torch.tools.play.captions import captioned
+from arcade_torch.tools.text import counted
 
 Frame = npt.NDArray[np.uint8]
 End = Literal["terminated", "truncated", "abandoned"]
@@ -51,7 +52,7 @@ class Attempt:
         return len(self.actions)
 
     def __str__(self) -> str:
-        return f"return {self.total:+.3f} in {self.steps} steps, {self.end}"
+        return f"return {self.total:+.3f} in {counted(self.steps, 'step')}, {self.end}"
 
 
 class Session:

@@ -452,5 +452,5 @@ def test_bad_input_is_refused() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             counterfactual_of_windows(policy, windows, **option)  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="nothing can be exchanged: 1 episodes of 3 frames"):
+    with pytest.raises(ValueError, match="nothing can be exchanged: 1 episode of 3 frames"):
         counterfactual_of_windows(policy, windows[:1])

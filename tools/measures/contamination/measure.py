@@ -53,6 +53,7 @@ from arcade_torch.tools.measures.windows import (
     play,
     resolve_agent,
 )
+from arcade_torch.tools.text import counted
 
 Ints = NDArray[np.int64]
 
@@ -281,7 +282,7 @@ class Disturber:
                 "the disturbed one"
             )
             episodes = self.skipped + len(self.changes)
-            raise ValueError(f"none of {episodes} episodes was long enough: {wanted}")
+            raise ValueError(f"none of {counted(episodes, 'episode')} was long enough: {wanted}")
         return Contamination(
             sigmas=self.disturbance.sigmas,
             delays=self.delays,
@@ -371,7 +372,7 @@ def contamination_example(
     w = next((window for window in windows if window.n == n), None)
     if w is None:
         raise ValueError(
-            f"none of {len(windows)} episodes was long enough: {n + 1} frames are needed"
+            f"none of {counted(len(windows), 'episode')} was long enough: {n + 1} frames are needed"
         )
     hits = np.array([-1] if shuffle else np.unique(np.linspace(1, n - 1, 3, dtype=np.int64)))
     order = np.tile(np.arange(n + 1), (1 + len(hits), 1))

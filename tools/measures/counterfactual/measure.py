@@ -41,6 +41,7 @@ from arcade_torch.tools.measures.windows import (
     greedy_windows,
     resolve_agent,
 )
+from arcade_torch.tools.text import counted
 
 Ints = NDArray[np.int64]
 Effect = Literal["flip", "distance", "change"]
@@ -427,10 +428,11 @@ class Exchange:
     def result(self) -> Counterfactual:
         """All decisions; a ``ValueError`` if none had a donor."""
         if not any(np.isfinite(effects.differs).any() for effects in self.by_frame):
+            played = counted(len(self.tracks), "episode")
             raise ValueError(
-                f"nothing can be exchanged: {len(self.tracks)} episodes of {MIN_STEPS} frames or "
-                f"more (and {self.dropped} shorter), and two with a step in common are needed; "
-                "play more episodes"
+                f"nothing can be exchanged: {played} of {MIN_STEPS} frames or more (and "
+                f"{self.dropped} shorter), and two with a step in common are needed; play more "
+                "episodes"
             )
         lags = max(len(effects.flip) for effects in self.by_frame)
         of_frames = [_padded(arrays, lags) for arrays in zip(*self.by_frame, strict=True)]
