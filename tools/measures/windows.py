@@ -160,8 +160,9 @@ def greedy_windows(
                     "let it draw from that seed alone, or take a larger cap"
                 )
             ends = np.where(late, cap - 1, ends)
-        for window, n in zip(windows[: episodes - group * size], ends, strict=False):
-            if group == 0:
+        wanted = windows[: episodes - group * size]
+        for row, (window, n) in enumerate(zip(wanted, ends, strict=False)):
+            if group == 0 or row == 0:  # of later batches one: it costs a tenth of a measure
                 check_choices(agent, window)
             yield window.up_to(int(n))
 

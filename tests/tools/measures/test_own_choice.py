@@ -77,6 +77,32 @@ def test_a_mask_behind_the_outputs_that_counts_late_is_refused(measure: str) -> 
         run[measure](choosing(masked))
 
 
+@pytest.mark.parametrize("measure", DECISIONS)
+def test_another_choice_in_a_later_batch_is_refused(measure: str) -> None:
+    """Before: the first batch of episodes alone was looked at."""
+
+    class Later(ToyEnv):
+        batches = 0
+
+        def reset(self) -> TensorDict:
+            self.batches += 1
+            return super().reset()
+
+    env = Later([9, 9])
+
+    def late(values: Tensor) -> Tensor:
+        return best(values) if env.batches < 2 else worst(values)
+
+    run: dict[str, Callable[[Any], Any]] = {
+        "recall density": lambda policy: recall_density(policy, env, episodes=4),
+        "counterfactual": lambda policy: counterfactual(policy, env, episodes=4, donors=1),
+        "contamination": lambda policy: contamination(policy, env, delays=(0, 1), starts=40),
+    }
+    with pytest.raises(ValueError, match=REFUSED):
+        run[measure](choosing(late))
+    assert env.batches == 2
+
+
 def test_a_mask_that_is_written_is_named_and_measured() -> None:
     torch.manual_seed(0)
 
