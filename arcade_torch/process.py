@@ -31,9 +31,9 @@ def check_process() -> None:
     if _started_in not in (None, os.getpid()):
         raise RuntimeError(
             "this process was forked after JAX had started, where JAX hangs: start workers with "
-            "'spawn' (Gymnasium: "
-            "vector_kwargs={'context': 'spawn'}), or leave vectorization_mode out of make_vec: it "
-            "needs no workers"
+            "'spawn' (TorchRL: mp_start_method='spawn'; Gymnasium: "
+            "vector_kwargs={'context': 'spawn'}, or leave vectorization_mode out of make_vec, "
+            "which needs no workers)"
         )
 
 

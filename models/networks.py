@@ -104,8 +104,15 @@ class MemoryBlock(nn.Module):
     ) -> tuple[Tensor, TensorDict]:
         x = self.linear(x)
         states = {}
-        for name, read, linear in zip(self.names, readers, self.linears, strict=True):
+        layers = zip(self.names, self.cells, readers, self.linears, strict=True)
+        for name, cell, read, linear in layers:
             y, states[name] = read(x, state[name], is_init)
+            if y.dtype != x.dtype or y.shape != x.shape:
+                raise ValueError(
+                    f"{type(cell).__name__} gives y {y.dtype} {list(y.shape)} for x "
+                    f"{x.dtype} {list(x.shape)}: its outputs have the type of x, y.to(x.dtype), "
+                    "and hidden_size features"
+                )
             y = F.leaky_relu_(F.layer_norm(linear(y), (self.hidden_size,)))
             x = x + y if self.residual else y
         return x, TensorDict(states, batch_size=batch_size)

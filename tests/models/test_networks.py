@@ -227,6 +227,35 @@ def test_a_memory_of_ones_own_can_be_a_factory():
     assert made == [(128, 128, {"depth": 3})]
 
 
+class OfOtherOutputs(nn.Module):
+    """A memory that gives something else than float32 [B, T, H]."""
+
+    def __init__(self, dtype, width):
+        super().__init__()
+        self.linear = nn.Linear(8, width, dtype=dtype)
+
+    def initial_state(self, batch_size):
+        return TensorDict({"h": torch.zeros(batch_size, 1)}, [batch_size])
+
+    def forward(self, x, state, is_init):
+        return self.linear(x.to(self.linear.weight.dtype)), state
+
+
+@pytest.mark.parametrize(
+    ("dtype", "width", "said"),
+    [
+        (torch.bfloat16, 8, r"y torch.bfloat16 \[2, 3, 8\] for x torch.float32 \[2, 3, 8\]"),
+        (torch.float32, 5, r"y torch.float32 \[2, 3, 5\] for x torch.float32 \[2, 3, 8\]"),
+    ],
+)
+def test_a_memory_of_other_outputs_is_told_in_one_line(dtype, width, said):
+    """Before: 'mat1 and mat2 must have the same dtype', told as a fault of ours by train."""
+    block = MemoryBlock(4, 8, lambda input_size, hidden_size: OfOtherOutputs(dtype, width))
+    x, is_init = torch.zeros(2, 3, 4), torch.zeros(2, 3, dtype=torch.bool)
+    with pytest.raises(ValueError, match=f"OfOtherOutputs gives {said}"):
+        block(x, block.initial_state(2), is_init)
+
+
 def test_calibration_goes_through_the_network_and_is_saved_with_it():
     pixels = inputs(4, 3, 128)[0]
     network, twin = make_network("small", "mlp"), make_network("small", "mlp")
