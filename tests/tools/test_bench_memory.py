@@ -8,7 +8,6 @@ import torch
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.models import linear_scan, scan
 from arcade_torch.tools import cli
-from arcade_torch.tools.bench.harness import KINDS, REST, op_breakdown
 from arcade_torch.tools.bench.loops import LOOPS, unbind_loop
 from arcade_torch.tools.bench.memory import (
     COPY,
@@ -76,16 +75,6 @@ def test_saliency_is_timed_in_two_stages_and_through_the_whole_network() -> None
     ours, whole = bench_saliency(4, CPU, 0.01, 1)
     assert (ours["way"], whole["way"]) == ("two stages", "whole network")
     assert ours["both_ms"] > 0 and whole["both_ms"] > 0
-
-
-def test_kinds_of_operation_share_the_time_of_the_work() -> None:
-    x, weight = (
-        torch.rand(4, 8, 32, 32, requires_grad=True),
-        torch.rand(8, 8, 3, 3, requires_grad=True),
-    )
-    shares = op_breakdown(lambda: torch.nn.functional.conv2d(x, weight).square().sum().backward())
-    assert set(shares) == {*KINDS, REST} and sum(shares.values()) == pytest.approx(1)
-    assert shares["convolutions"] > 0.2 and shares["recurrence"] == 0
 
 
 def test_the_command_prints_all_tables_and_writes_them(

@@ -6,11 +6,13 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
 from arcade_torch.agents import trainer
 from arcade_torch.agents.learner import Learner
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench import train as bench
+from arcade_torch.tools.bench.train import KINDS, REST, op_breakdown
 
 
 def test_the_benchmark_times_whole_parts_and_its_table_is_saved(
@@ -94,10 +96,20 @@ def test_wrong_options_get_one_line(
     assert said in err and err.count("\n") == 1
 
 
+def test_kinds_of_operation_share_the_time_of_the_work() -> None:
+    x, weight = (
+        torch.rand(4, 8, 32, 32, requires_grad=True),
+        torch.rand(8, 8, 3, 3, requires_grad=True),
+    )
+    shares = op_breakdown(lambda: torch.nn.functional.conv2d(x, weight).square().sum().backward())
+    assert set(shares) == {*KINDS, REST} and sum(shares.values()) == pytest.approx(1)
+    assert shares["convolutions"] > 0.2 and shares["recurrence"] == 0
+
+
 def test_the_profiler_writes_no_lines_of_its_own() -> None:
     """Before: USDT:... SyncActivityProfilerHandler.cpp:52] profiler_start, among ours."""
     source = (
-        "import torch; from arcade_torch.tools.bench.harness import op_breakdown\n"
+        "import torch; from arcade_torch.tools.bench.train import op_breakdown\n"
         "print(sum(op_breakdown(lambda: torch.ones(9) + 1).values()))"
     )
     ran = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, check=True)

@@ -1,16 +1,14 @@
-"""What all benchmarks share: measures in turns with every result consumed, and kinds of operation.
+"""What all benchmarks share: measures in turns with every result consumed.
 
 Measures take turns, so that a slow minute of the machine hits all of them alike. The clock is
 torch's, which waits for the device.
 """
 
-import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
 
-from torch.profiler import profile
 from torch.utils.benchmark import timer
 
 
@@ -77,46 +75,3 @@ def interleaved(
             into.rates.append(units / working)
             into.rates_with_check.append(units / (working + checking))
     return measured
-
-
-KINDS = {
-    "convolutions": ("convolution",),
-    "pooling": ("max_pool",),
-    "recurrence": ("linear_scan", "matrix_scan"),
-    "matrix products": ("addmm", "::mm", "bmm", "matmul"),
-    "activations": ("leaky_relu",),
-    "copies and casts": (
-        "copy",
-        "aten::cat",
-        "clone",
-        "index_select",
-        "aten::fill_",
-        "aten::zero_",
-    ),
-}
-"""Kinds of operation, by parts of their names; the rest is elementwise work."""
-REST = "the rest"
-
-
-def op_breakdown(work: Callable[[], object]) -> dict[str, float]:
-    """Shares of the kinds of operation in the time of some work, by torch's profiler: CUDA kernels
-    where there are any.
-
-    On a CPU the profiler's own memory makes copies look a little dearer than they are.
-    """
-    work()
-    # else the first profiler of a process writes lines of its own to stderr
-    os.environ.setdefault("KINETO_LOG_LEVEL", "99")
-    with profile() as run:
-        work()
-    events = list(run.key_averages())
-    on_card = sum(event.self_device_time_total for event in events)
-    seconds = dict.fromkeys([*KINDS, REST], 0.0)
-    for event in events:
-        kind = next(
-            (kind for kind, names in KINDS.items() if any(name in event.key for name in names)),
-            REST,
-        )
-        seconds[kind] += event.self_device_time_total if on_card else event.self_cpu_time_total
-    total = sum(seconds.values())
-    return {kind: value / total for kind, value in seconds.items()}

@@ -4,17 +4,19 @@ of operation.
 
 import dataclasses
 import itertools
+import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from torch.profiler import profile
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.trainer import Trainer
-from arcade_torch.tools.bench.harness import Measure, interleaved, op_breakdown
+from arcade_torch.tools.bench.harness import Measure, interleaved
 from arcade_torch.tools.bench.registry import BenchOptions
 from arcade_torch.tools.machine import torch_threads
 from arcade_torch.tools.options import at_least
@@ -132,3 +134,46 @@ def _measure(trainer: Trainer, form: str, options: Options) -> dict[str, Any]:
         "train_fps": 1 / (1 / collect_fps + 1 / learn_fps),
     }
     return row | {f"learning: {kind}": value for kind, value in op_breakdown(learn).items()}
+
+
+KINDS = {
+    "convolutions": ("convolution",),
+    "pooling": ("max_pool",),
+    "recurrence": ("linear_scan", "matrix_scan"),
+    "matrix products": ("addmm", "::mm", "bmm", "matmul"),
+    "activations": ("leaky_relu",),
+    "copies and casts": (
+        "copy",
+        "aten::cat",
+        "clone",
+        "index_select",
+        "aten::fill_",
+        "aten::zero_",
+    ),
+}
+"""Kinds of operation, by parts of their names; the rest is elementwise work."""
+REST = "the rest"
+
+
+def op_breakdown(work: Callable[[], object]) -> dict[str, float]:
+    """Shares of the kinds of operation in the time of some work, by torch's profiler: CUDA kernels
+    where there are any.
+
+    On a CPU the profiler's own memory makes copies look a little dearer than they are.
+    """
+    work()
+    # else the first profiler of a process writes lines of its own to stderr
+    os.environ.setdefault("KINETO_LOG_LEVEL", "99")
+    with profile() as run:
+        work()
+    events = list(run.key_averages())
+    on_card = sum(event.self_device_time_total for event in events)
+    seconds = dict.fromkeys([*KINDS, REST], 0.0)
+    for event in events:
+        kind = next(
+            (kind for kind, names in KINDS.items() if any(name in event.key for name in names)),
+            REST,
+        )
+        seconds[kind] += event.self_device_time_total if on_card else event.self_cpu_time_total
+    total = sum(seconds.values())
+    return {kind: value / total for kind, value in seconds.items()}
