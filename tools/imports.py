@@ -312,6 +312,11 @@ def _load(name: str, text: bytes | None = None, expected: str = "") -> None:
             importlib.import_module(name)
     except ImportRefusedError:
         raise
+    except SystemExit as error:
+        raise ValueError(
+            f"{FLAG} {name}: it ended the program while it was imported (SystemExit: {error}); "
+            "what it does as a program belongs below if __name__ == '__main__':"
+        ) from error
     except Exception as error:
         if not isinstance(error, ModuleNotFoundError):
             why = f"it could not be imported, {type(error).__name__}: {one_line(error)}"

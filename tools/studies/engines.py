@@ -94,7 +94,7 @@ class Job(NamedTuple):
         """
         try:
             self.train()
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # a memory model of somebody's may call sys.exit
             return reason(error), traceback.format_exc()
         return "", ""
 
