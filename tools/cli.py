@@ -23,6 +23,7 @@ from arcade_torch.tools.errors import (
     is_of_the_machine,
     is_told,
     one_line,
+    reason,
     trouble_of_the_machine,
 )
 from arcade_torch.tools.figures.catalogue import FIGURES
@@ -215,6 +216,8 @@ def _carry_out(words: Sequence[str], begun: list[Any]) -> int:
     except SystemExit as stop:
         if isinstance(stop.__context__, BrokenPipeError):  # this is what rich makes of it
             return EXIT_OK
+        if begun:  # none of our commands ends so, but a memory model of somebody's may
+            return _tell(stop)
         if stop.code:
             return stop.code if isinstance(stop.code, int) else EXIT_FAILED
         print(EVERYWHERE)  # below the help of a command
@@ -278,8 +281,10 @@ def _tell_stopped(begun: Sequence[Any]) -> int:
     return EXIT_INTERRUPTED
 
 
-def _tell(error: Exception) -> int:
-    """Say what went wrong, in one line unless it is a fault; returns the exit code."""
+def _tell(error: BaseException) -> int:
+    """Say what went wrong, in one line unless it is a fault, where that is the last line; returns
+    the exit code.
+    """
     if isinstance(error, BrokenPipeError):  # the reader of stdout, such as head, has what it wanted
         _close_stdout()
         return EXIT_OK
@@ -312,8 +317,12 @@ def _tell(error: Exception) -> int:
         if modules_of_user
         else "this is a fault of arcade-torch; please report it with what follows"
     )
-    for line in "".join(traceback.format_exception(error)).rstrip("\n").split("\n"):
+    lines = "".join(traceback.format_exception(error)).rstrip("\n").split("\n")
+    for line in lines:
         warn(line)
+    why = reason(error)
+    if lines[-1] != why:  # a note of a library, or a message of several lines
+        _say(why)
     return EXIT_FAILED
 
 

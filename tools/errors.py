@@ -171,7 +171,9 @@ def _of_a_file(error: OSError) -> str:
 
 def reason(error: BaseException) -> str:
     """Why something failed, in one line."""
-    return one_line(error) if is_told(error) else f"{type(error).__name__}: {one_line(error)}"
+    says = one_line(error)
+    kind = type(error).__name__
+    return says if is_told(error) or says == kind else f"{kind}: {says}"
 
 
 _JAX_SETTING = re.compile("for (environment 'JAX_|JAX flag jax_)")

@@ -35,17 +35,21 @@ HASHES_VARIABLE = "ARCADE_TORCH_IMPORT_SHA256"
 """The same for the SHA-256 of the files, in JSON: a worker imports what its study began with."""
 MOST_SOURCE = 16 * 2**20
 """Bytes of the largest file that is imported."""
-MOST_REMEMBERED = 100
+MOST_BESIDE = 400
+"""Modules beside one file that are remembered with it."""
+MOST_REMEMBERED = 2_000
 """Imports of one run."""
 MOST_TRUSTED = 1_000
 """Entries in the user's record; the oldest are forgotten."""
 LOCK_LIMIT_S = 10.0
 """So long another process may write that record; after that, nothing is noted."""
 Import = dict[str, str]
-"""``name``, of a file its absolute path, and ``sha256``, which is empty for a module."""
+"""``name``, of a file its absolute path, and ``sha256``, which is empty for a module; of a module
+that lies beside a file and was imported by it also ``by``, that file."""
 
 _HASH = re.compile("[0-9a-f]{64}")
 _hashes: dict[str, str] = {}  # file that was imported in this process -> SHA-256 of its text
+_beside: dict[str, list[Import]] = {}  # such a file -> the modules beside it that it imported
 _again: set[str] = set()  # what was imported in this process because a run remembers it
 
 
@@ -131,7 +135,10 @@ def load_extensions(names: Sequence[str] = ()) -> None:
 def _hand_on(names: Iterable[str]) -> None:
     """Tell worker processes what to import."""
     os.environ[VARIABLE] = "\n".join(names)
-    os.environ[HASHES_VARIABLE] = json.dumps(_hashes)
+    hashes = dict(_hashes)
+    for entries in _beside.values():
+        hashes |= {entry["name"]: entry["sha256"] for entry in entries}
+    os.environ[HASHES_VARIABLE] = json.dumps(hashes)
 
 
 def for_workers() -> dict[str, str]:
@@ -152,7 +159,11 @@ def imports_of(config: "TrainConfig") -> list[Import]:
 
     if is_our_game(config.env) and not is_from_user(config.memory):
         return []
-    return [{"name": name, "sha256": _hashes.get(name, "")} for name in imported()]
+    entries = list[Import]()
+    for name in imported():
+        entries.append({"name": name, "sha256": _hashes.get(name, "")})
+        entries += _beside.get(name, [])
+    return entries
 
 
 def is_from_user(memory: str) -> bool:
@@ -183,8 +194,11 @@ def import_again(path: Path) -> None:
     for folder in (absolute, *absolute.parents[:2]):
         file = folder / "config.json"
         if file.is_file():
-            for name, sha256 in remembered_imports(read_json(file), file).items():
-                _import_again(path, name, sha256)
+            entries = _remembered(read_json(file), file)
+            for entry in entries:
+                if "by" not in entry:
+                    _import_again(path, entry["name"], entry["sha256"])
+            _check_beside(path, [entry for entry in entries if "by" in entry])
             return
 
 
@@ -211,18 +225,21 @@ def existing_agent(path: Path) -> Path:
 
 
 def remembered_imports(record: Any, file: Path) -> dict[str, str]:
-    """The imports in what a ``config.json`` holds, name -> SHA-256; a ``ValueError`` if they are
-    damaged.
+    """The imports in what a ``config.json`` holds, name -> SHA-256, with the modules beside files;
+    a ``ValueError`` if they are damaged.
     """
+    return {entry["name"]: entry["sha256"] for entry in _remembered(record, file)}
+
+
+def _remembered(record: Any, file: Path) -> list[Import]:
+    """The same as they stand there."""
     imports = record.get("imports", []) if isinstance(record, Mapping) else []
     if not isinstance(imports, list) or len(imports) > MOST_REMEMBERED:
         raise ValueError(f"{file} is damaged: its imports are no list of at most {MOST_REMEMBERED}")
-    hashes = dict[str, str]()
     for entry in imports:
         if not isinstance(entry, dict) or not _is_import(entry.get("name"), entry.get("sha256")):
             raise ValueError(f"{file} is damaged: an import has a name and a sha256")
-        hashes[entry["name"]] = entry["sha256"]
-    return hashes
+    return imports
 
 
 def _is_import(name: object, sha256: object) -> bool:
@@ -261,6 +278,24 @@ def _import_again(run: Path, name: str, sha256: str) -> None:
     _load(name, text)
     _again.add(name)
     _hand_on(dict.fromkeys([*imported(), name]))
+
+
+def _check_beside(run: Path, entries: Sequence[Import]) -> None:
+    """Refuse a run whose file imported a module beside it that is another now. Only what has been
+    imported is looked at.
+    """
+    if not entries:
+        return
+    now = set[str]()
+    for file in list(_hashes):
+        now |= {entry["sha256"] for entry in _modules_beside(file, sys.modules)}
+    for entry in entries:
+        if entry["sha256"] not in now:
+            raise ImportRefusedError(
+                f"{run} imported {entry['name']} by way of {entry['by']}, and it has changed "
+                f"since: put it back, or pass {FLAG} {shlex.quote(str(entry['by']))} to take it as "
+                "it is now"
+            )
 
 
 def record_file() -> Path:
@@ -312,6 +347,11 @@ def _load(name: str, text: bytes | None = None, expected: str = "") -> None:
             importlib.import_module(name)
     except ImportRefusedError:
         raise
+    except SystemExit as error:
+        raise ValueError(
+            f"{FLAG} {name}: it ended the program while it was imported (SystemExit: {error}); "
+            "what it does as a program belongs below if __name__ == '__main__':"
+        ) from error
     except Exception as error:
         if not isinstance(error, ModuleNotFoundError):
             why = f"it could not be imported, {type(error).__name__}: {one_line(error)}"
@@ -320,8 +360,17 @@ def _load(name: str, text: bytes | None = None, expected: str = "") -> None:
                 f"{FLAG} {name}: there is no module of that name; a file needs its .py"
             ) from error
         else:
-            why = f"it imports {error.name}, which is not installed"
+            why = f"it imports {error.name}, which is not installed{_path_hint(name, error)}"
         raise ValueError(f"{FLAG} {name}: {why}") from error
+
+
+def _path_hint(name: str, error: ModuleNotFoundError) -> str:
+    """How a module that lies beside a file is found; empty if it lies elsewhere."""
+    folder = Path(name).parent
+    top = folder / str(error.name).partition(".")[0]
+    if not _is_file(name) or not (top.is_dir() or top.with_suffix(".py").is_file()):
+        return ""
+    return f"; it lies beside that file: set PYTHONPATH={shlex.quote(str(folder))}"
 
 
 def _run_file(name: str, text: bytes | None, expected: str) -> None:
@@ -333,10 +382,8 @@ def _run_file(name: str, text: bytes | None, expected: str) -> None:
         text = read_bytes(Path(name), MOST_SOURCE)
     sha256 = hashlib.sha256(text).hexdigest()
     if expected and expected != sha256:
-        raise ImportRefusedError(
-            f"{FLAG} {name}: it has changed since this work began: put it back as it was, or "
-            "start anew"
-        )
+        raise _changed(name)
+    before = set(sys.modules)
     loader = _Source(module, name, text)
     spec: Any = importlib.util.spec_from_file_location(module, name, loader=loader)
     sys.modules[module] = importlib.util.module_from_spec(spec)
@@ -345,4 +392,34 @@ def _run_file(name: str, text: bytes | None, expected: str) -> None:
     except BaseException:
         del sys.modules[module]
         raise
+    beside = _modules_beside(name, set(sys.modules) - before)
+    for entry in beside:
+        if expected and _parents.get(entry["name"], entry["sha256"]) != entry["sha256"]:
+            del sys.modules[module]
+            raise _changed(entry["name"])
     _hashes[name] = sha256
+    _beside[name] = beside
+
+
+def _modules_beside(name: str, modules: Iterable[str]) -> list[Import]:
+    """Those of some modules that lie in the folder of a file, or below it, and are not installed
+    there.
+    """
+    folder = os.path.join(os.path.dirname(name), "")
+    entries = dict[str, Import]()
+    for module in sorted(modules):
+        file = os.path.realpath(getattr(sys.modules.get(module), "__file__", None) or "")
+        is_ours = module.partition(".")[0] in ("__main__", "arcade_torch")
+        is_installed = "site-packages" in file or "dist-packages" in file
+        is_beside = file.startswith(folder) and file.endswith(".py") and file != name
+        if is_beside and not is_ours and not is_installed:
+            with contextlib.suppress(OSError, ValueError):  # gone since, or no regular file
+                sha256 = hashlib.sha256(read_bytes(Path(file), MOST_SOURCE)).hexdigest()
+                entries[file] = {"name": file, "sha256": sha256, "by": name}
+    return list(entries.values())[:MOST_BESIDE]
+
+
+def _changed(name: str) -> ImportRefusedError:
+    return ImportRefusedError(
+        f"{FLAG} {name}: it has changed since this work began: put it back as it was, or start anew"
+    )

@@ -264,6 +264,45 @@ def test_a_failure_below_what_was_imported_is_not_called_ours(
     )
 
 
+@pytest.mark.usefixtures("own_registry")
+@pytest.mark.parametrize("code", ["0", "None", "3", "'no data'"])
+def test_a_program_that_ends_in_the_middle_of_its_work_has_failed(
+    code: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A memory model that called ``sys.exit`` ended a whole study without a word, with 0 as if it
+    were done.
+    """
+    from arcade_torch.tools.commands import list as command
+
+    text = f"import arcade_torch.tools\ndef ends(): raise SystemExit({code})\n"
+    (tmp_path / "mine.py").write_text(f"{text}arcade_torch.tools.ends = ends\n")
+    monkeypatch.setattr(command.List, "run", lambda self: sys.modules["arcade_torch.tools"].ends())
+    assert cli.main(["list", "--import", str(tmp_path / "mine.py")]) == cli.EXIT_FAILED
+    said = capsys.readouterr().err
+    assert said.startswith(f"arcade-torch: {tmp_path / 'mine.py'} failed:\n"), said
+    assert "in ends\n" in said and "SystemExit" in said.splitlines()[-1]
+
+
+@pytest.mark.parametrize("words", ["the last layer\nis broken", "the last layer is broken"])
+def test_the_last_line_of_a_traceback_says_why_in_one_line(
+    words: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A study keeps that line: of a run in a process it kept the note of tensordict below it,
+    "Failed while executing module '0'.".
+    """
+    from arcade_torch.tools.commands import list as command
+
+    def fails(self: object) -> int:
+        error = RuntimeError(words)
+        error.add_note("Failed while executing module '0'.")
+        raise error
+
+    monkeypatch.setattr(command.List, "run", fails)
+    assert cli.main(["list"]) == cli.EXIT_FAILED
+    last = "arcade-torch: RuntimeError: the last layer is broken"
+    assert capsys.readouterr().err.splitlines()[-1] == last
+
+
 def test_an_interruption_says_how_to_go_on(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

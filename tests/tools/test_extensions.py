@@ -78,6 +78,8 @@ def test_a_worker_process_knows_the_game_of_the_study_that_started_it() -> None:
         ("import no_such_library", "it imports no_such_library, which is not installed"),
         ("1 / 0", "it could not be imported, ZeroDivisionError: division by zero"),
         ("def", "it could not be imported, SyntaxError"),
+        ("raise SystemExit(0)", "it ended the program while it was imported (SystemExit: 0)"),
+        ("import sys; sys.exit('no card')", "imported (SystemExit: no card)"),
     ],
 )
 def test_a_file_that_cannot_be_imported_is_one_line(

@@ -284,8 +284,11 @@ def test_a_study_does_not_go_on_with_runs_of_an_older_text(folder: Path, tmp_pat
     (run / "eval.json").unlink()
     study.claim(plan)  # it begins anew
     (run / "checkpoints/frames-000000000001").mkdir(parents=True)
-    with pytest.raises(FileExistsError, match=r"trained with .*yours\.py as it was before"):
+    with pytest.raises(FileExistsError, match=r"trained with .*yours\.py as it was before") as told:
         study.claim(plan)  # it would go on from what another text has learned
+    assert f"{run} was" in str(told.value) and "delete that folder to train" in str(told.value)
+    shutil.rmtree(run)
+    study.claim(plan)
 
 
 def test_a_worker_imports_what_its_study_began_with(

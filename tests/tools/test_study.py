@@ -410,12 +410,18 @@ def test_inline_runs_one_after_the_other_and_survives_exceptions(
     def train(job: Job) -> None:
         if job.name == "job1":
             raise RuntimeError("broken\nbadly")
+        if job.name == "job2":  # somebody's memory model called sys.exit
+            raise SystemExit(0)
+        if job.name == "job3":
+            raise AssertionError
 
     monkeypatch.setattr(Job, "train", train)
-    parts = jobs(tmp_path, "", "", "")
+    parts = jobs(tmp_path, "", "", "", "", "")
     assert [result.error for result in Inline().run(parts)] == [
         "",
         "RuntimeError: broken badly",
+        "SystemExit: 0",
+        "AssertionError",
         "",
     ]
     assert "in train\n" in parts[1].log.read_text() and not parts[0].log.exists()

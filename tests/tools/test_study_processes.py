@@ -2,19 +2,23 @@
 another.
 """
 
+import io
 import os
 import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from arcade_torch.tools.machine import available_cores
-from arcade_torch.tools.studies import processes
+from arcade_torch.tools.studies import processes, runner
+from arcade_torch.tools.studies.engines import Ray
 from arcade_torch.tools.studies.processes import Processes
-from tests.tools.fabricated import jobs
+from arcade_torch.tools.studies.runner import study
+from tests.tools.fabricated import jobs, small_study
 
 EXECUTE = """
 import pathlib
@@ -260,3 +264,35 @@ def test_a_worker_stops_when_its_study_is_gone(tmp_path: Path) -> None:
     while not (tmp_path / "saved").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     assert (tmp_path / "saved").exists()
+
+
+def test_runs_with_several_threads_get_as_many_cores(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Each of sixteen runs had its four threads on one core, and was four times slower."""
+    monkeypatch.setattr(runner, "available_cores", lambda: list(range(16)))
+    used = list[Any]()
+
+    class Kept(Processes):
+        def run(self, jobs: Any) -> Any:
+            used.append(self.workers)
+            yield from ()
+
+    class KeptRay(Ray):
+        def run(self, jobs: Any) -> Any:
+            yield from ()
+
+    for threads, workers in ((1, 0), (4, 4), (32, 1)):
+        what = small_study(settings={"threads": threads})
+        study(what, tmp_path / "s", Kept(), stream=io.StringIO())
+        assert used.pop() == workers
+    study(what, tmp_path / "s", Kept(16), stream=io.StringIO())
+    assert used.pop() == 16  # the user says so
+    assert not capsys.readouterr().err
+    study(what, tmp_path / "s", KeptRay(module=object(), cpus_per_run=32), stream=io.StringIO())
+    assert not capsys.readouterr().err
+    study(what, tmp_path / "s", KeptRay(module=object()), stream=io.StringIO())
+    said = capsys.readouterr().err
+    assert said == (
+        "a run has 32 threads and Ray gives it 1 cores: --cpus-per-run 32 gives it as many\n"
+    )

@@ -35,6 +35,14 @@ class FakeRay:
         self.do, self.cores, self.most = do, cores, 0
         self.flying, self.cancelled, self.options = dict[int, Any](), list[int](), dict[str, Any]()
         self.count = 0
+        self.head = "auto"  # no address that could be called
+
+    def get_runtime_context(self) -> Any:
+        return SimpleNamespace(gcs_address=self.head)
+
+    def nodes(self) -> list[dict[str, Any]]:
+        lost = {"Alive": False, "Resources": {"CPU": 64.0}}
+        return [lost, {"Alive": True, "Resources": {"CPU": self.cores}}]
 
     def is_initialized(self) -> bool:
         return True
@@ -115,8 +123,61 @@ def test_closing_the_engine_cancels_what_still_runs(tmp_path: Path) -> None:
 def test_a_run_that_no_machine_can_hold_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="wants 4 cores and 0 GPUs, this machine has 2 and 0"):
         run_all(FakeRay(fine), some_jobs(tmp_path), cpus_per_run=4)
+    with pytest.raises(ValueError, match="wants 1 cores and 1 GPUs, this machine has 2 and 0"):
+        run_all(FakeRay(fine), some_jobs(tmp_path), gpus_per_run=1)
     with pytest.raises(ValueError, match="cpus-per-run must be above 0"):
         Ray(module=FakeRay(fine), cpus_per_run=0)
+
+
+@pytest.mark.parametrize(
+    ("options", "wants"),
+    [({"cpus_per_run": 4}, "4 cores and 0 GPUs"), ({"gpus_per_run": 0.5}, "1 cores and 0.5 GPUs")],
+)
+def test_a_cluster_on_which_no_machine_can_hold_a_run_is_said_to_be_waited_for(
+    options: dict[str, Any], wants: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its runs waited for ever, without a word; the lost machine's 64 cores are none."""
+    run_all(FakeRay(fine), some_jobs(tmp_path), address="auto", **options)
+    said = capsys.readouterr().err
+    assert said.startswith(f"a run wants {wants}, which no machine of the cluster at auto has")
+    assert said.count("\n") == 1
+    run_all(FakeRay(fine), some_jobs(tmp_path), address="auto")
+    assert not capsys.readouterr().err
+
+
+@pytest.mark.parametrize("address", ["", "auto"])
+def test_a_cluster_whose_head_is_gone_is_lost_after_a_time(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a minute Ray ended the whole study, without a table and without a word of how to go
+    on. Until then it did not come back from a question about the cluster.
+    """
+
+    def ask() -> dict[str, float]:
+        raise AssertionError("asked a cluster without a head")
+
+    ray = FakeRay(fine)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ray.head = f"127.0.0.1:{server.getsockname()[1]}"
+        results = Ray(module=ray, address=address).run(some_jobs(tmp_path, 4))
+        assert next(results).error == ""
+    monkeypatch.setattr(ray, "cluster_resources", ask)
+    assert next(results).error == ""  # it may come back
+    monkeypatch.setattr(engines, "LOST_S", 0.0)
+    with pytest.raises(ClusterLostError, match=f"at {ray.head}, has not answered for 0 s; finish"):
+        next(results)
+    assert ray.cancelled == [3, 4]
+
+
+def test_a_head_that_cannot_be_reached_from_here_is_not_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A client of ``ray://HOST:PORT`` sees that port alone."""
+    monkeypatch.setattr(engines, "LOST_S", 0.0)
+    ray = FakeRay(fine)
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ray.head = f"127.0.0.1:{server.getsockname()[1]}"
+    assert len(run_all(ray, some_jobs(tmp_path), address="auto")) == 3
 
 
 @pytest.mark.parametrize("scheme", ["", "ray://"])

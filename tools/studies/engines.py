@@ -16,6 +16,7 @@ import socket
 import sys
 import tempfile
 import threading
+import time
 import traceback
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -36,12 +37,18 @@ from arcade_torch.agents.runs.files import (
 from arcade_torch.tools.errors import need, one_line, reason
 from arcade_torch.tools.imports import for_workers, imports_of, load_extensions
 from arcade_torch.tools.machine import available_cores, keep_freed_memory
+from arcade_torch.tools.text import warn
 
 GRACE_S = 60.0
 """How long an interrupted run may take to write its checkpoint before it is killed."""
 
 CONNECT_S = 30.0
 """How long a Ray cluster may take to answer."""
+
+LOST_S = 40.0
+"""A Ray cluster that has not answered for so long is lost; after 60 s Ray ends this process."""
+LOST_GRACE_S = 5.0
+"""How long its runs may take to save, if they can still be reached."""
 
 _NOT_SENT = {"trainer.pt", "replay", "lock"}  # needed only to go on training
 _QUIET = {
@@ -94,7 +101,7 @@ class Job(NamedTuple):
         """
         try:
             self.train()
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # a memory model of somebody's may call sys.exit
             return reason(error), traceback.format_exc()
         return "", ""
 
@@ -152,7 +159,7 @@ class Inline:
 
 
 class ClusterLostError(RuntimeError):
-    """The cluster that a study started for itself is no more; what is finished is kept."""
+    """The cluster that a study uses is no more; what is finished is kept."""
 
 
 @dataclass
@@ -194,14 +201,7 @@ class Ray(RayOptions):
     def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
         """Run the jobs as there is room; on Ctrl-C or close each run gets time to save."""
         with self._cluster() as ray:
-            resources = ray.cluster_resources()
-            cpus = resources.get("CPU", 0)
-            gpus = resources.get("GPU", 0)
-            if not self.address and (cpus < self.cpus_per_run or gpus < self.gpus_per_run):
-                raise ValueError(
-                    f"a run wants {self.cpus_per_run:g} cores and {self.gpus_per_run:g} GPUs, this "
-                    f"machine has {cpus:g} and {gpus:g}: lower --cpus-per-run or --gpus-per-run"
-                )
+            self._check_room(ray)
             options = {
                 "num_cpus": self.cpus_per_run,
                 "num_gpus": self.gpus_per_run,
@@ -209,8 +209,10 @@ class Ray(RayOptions):
             }
             environment = {"env_vars": for_workers()}
             task = ray.remote(max_calls=1, runtime_env=environment, **options)(carry_out)
+            head = _Head(ray.get_runtime_context().gcs_address)
             waiting = list(jobs)
             flying = dict[Any, Job]()
+            grace_s = GRACE_S
             try:
                 while waiting or flying:
                     while waiting and len(flying) < (self.workers or len(waiting) + len(flying)):
@@ -220,21 +222,42 @@ class Ray(RayOptions):
                         )
                         flying[task.remote(there, read_bytes(job.config, MOST_JSON))] = job
                     ready, _ = ray.wait(list(flying), num_returns=1, timeout=1.0)
-                    # it began with all cores
-                    if not self.address and not ray.cluster_resources().get("CPU"):
-                        raise ClusterLostError(
-                            "Ray's node on this machine is gone (killed, or out of memory); "
-                            "finished runs are kept, "
-                            "the same command goes on with the others"
-                        )
+                    # without its head, Ray does not come back from a question about the cluster
+                    if head.answers() and not self.address:
+                        _check_node(ray)
                     for reference in ready:
                         yield _result(ray, reference, flying.pop(reference))
+            except ClusterLostError:
+                grace_s = LOST_GRACE_S
+                raise
             finally:
                 for reference in flying:
                     with contextlib.suppress(Exception):
                         ray.cancel(reference, force=False)  # an interrupt in the task, which saves
                 with contextlib.suppress(Exception):
-                    ray.wait(list(flying), num_returns=len(flying), timeout=GRACE_S)
+                    ray.wait(list(flying), num_returns=len(flying), timeout=grace_s)
+
+    def _check_room(self, ray: Any) -> None:
+        """Refuse a run that is too large for this machine; say so where it is too large for a
+        cluster, which another machine may join.
+        """
+        most = "nothing"
+        for node in ray.nodes():
+            resources = node["Resources"] if node["Alive"] else {}
+            cpus = resources.get("CPU", 0)
+            gpus = resources.get("GPU", 0)
+            if cpus >= self.cpus_per_run and gpus >= self.gpus_per_run:
+                return
+            most = f"{cpus:g} and {gpus:g}"
+        wanted = f"a run wants {self.cpus_per_run:g} cores and {self.gpus_per_run:g} GPUs"
+        if not self.address:
+            raise ValueError(
+                f"{wanted}, this machine has {most}: lower --cpus-per-run or --gpus-per-run"
+            )
+        warn(
+            f"{wanted}, which no machine of the cluster at {self.address} has: all wait until one "
+            "with that joins; if none is to come, stop, and lower --cpus-per-run or --gpus-per-run"
+        )
 
     @contextlib.contextmanager
     def _cluster(self) -> Iterator[Any]:
@@ -267,7 +290,10 @@ class Ray(RayOptions):
         try:
             ray.init(**options)
         except ConnectionError as error:
-            raise ValueError(f"no Ray cluster answers at {self.address!r}: {error}") from error
+            raise ValueError(
+                f"no Ray cluster answers at {self.address!r}: {error}; if it asks for a token "
+                "(InvalidAuthToken), set RAY_AUTH_MODE=token"
+            ) from error
         with contextlib.suppress(ValueError):  # not the main thread
             for number, handler in handlers.items():
                 signal.signal(number, handler)
@@ -279,13 +305,67 @@ class Ray(RayOptions):
 
 def _check_answers(address: str) -> None:
     """Refuse an address at which nothing listens: Ray tries for many minutes, without a word."""
-    url = urlsplit(address if "://" in address else f"//{address}")
-    if url.port is None:  # auto, or none
-        return
     try:
-        socket.create_connection((url.hostname or "", url.port), CONNECT_S).close()
+        _call(address, CONNECT_S)
     except OSError as error:
         raise ValueError(f"no Ray cluster answers at {address!r}: {error}") from error
+
+
+def _call(address: str, limit_s: float) -> None:
+    """Open a connection and close it; an ``OSError`` if nothing listens there. Of ``auto``, or
+    none, nothing is asked.
+    """
+    url = urlsplit(address if "://" in address else f"//{address}")
+    if url.port is not None:
+        socket.create_connection((url.hostname or "", url.port), limit_s).close()
+
+
+class _Head:
+    """The process of a Ray cluster that all others are connected to.
+
+    One that cannot be reached from this machine at the beginning, such as through a client's port,
+    is not asked.
+    """
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._answered_s = time.monotonic()
+        self._is_asked = self._can_be_called()
+
+    def answers(self) -> bool:
+        """Whether it answers now.
+
+        Raises:
+            ClusterLostError: it has not for `LOST_S`.
+        """
+        if not self._is_asked or self._can_be_called():
+            self._answered_s = time.monotonic()
+            return True
+        silent_s = time.monotonic() - self._answered_s
+        if silent_s > LOST_S:
+            raise ClusterLostError(
+                f"the Ray cluster, whose head was at {self._address}, has not answered for "
+                f"{silent_s:.0f} s; finished runs are kept, the same command, with a cluster that "
+                "answers, goes on with the others"
+            )
+        return False
+
+    def _can_be_called(self) -> bool:
+        try:
+            _call(self._address, LOST_GRACE_S)
+        except OSError:
+            return False
+        return True
+
+
+def _check_node(ray: Any) -> None:
+    """Raise if the one machine of a cluster of our own, which began with all cores, is gone."""
+    if not ray.cluster_resources().get("CPU"):
+        raise ClusterLostError(
+            "Ray's node on this machine is gone (killed, or out of memory); "
+            "finished runs are kept, "
+            "the same command goes on with the others"
+        )
 
 
 def carry_out(job: Job, config: bytes) -> tuple[str, str, dict[str, bytes]]:

@@ -297,8 +297,8 @@ def _check_imports(run: Run, plan: TrainConfig) -> None:
     for name, sha256 in run.imports.items():
         if sha256 not in now:
             raise FileExistsError(
-                f"{run.path} was trained with {name} as it was before it changed: put it back, or "
-                "choose another --out"
+                f"{run.path} was trained with {name} as it was before it changed: put it back, "
+                "delete that folder to train the run anew, or choose another --out"
             )
 
 

@@ -9,7 +9,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ from arcade_torch.tools.studies.folder import Row, StudyFolder
 from arcade_torch.tools.studies.grid import RunSpec, Study
 from arcade_torch.tools.studies.processes import Processes
 from arcade_torch.tools.studies.shards import part_of
+from arcade_torch.tools.text import warn
 
 LOOK_EVERY_S = 0.5
 """The display is drawn this often, or less often where a look at all runs takes long."""
@@ -122,6 +123,7 @@ def study(
     definition = plan_or_file if isinstance(plan_or_file, Study) else Study.load(plan_or_file)
     engine = make_engine(engine, workers) if isinstance(engine, str) else engine
     plan = planned(definition, shard, file)
+    engine = fit_threads(engine, plan.values())
     folder = StudyFolder(Path(out))
     try:
         folder.claim(definition, command)
@@ -158,6 +160,21 @@ def make_engine(name: str, workers: int = 0, ray: RayOptions | None = None) -> E
     if name in ("auto", "inline"):
         return Inline()
     raise ValueError(f"unknown engine {name!r}: allowed are auto, inline, processes, ray")
+
+
+def fit_threads(engine: Engine, configs: Iterable[TrainConfig]) -> Engine:
+    """An engine with room for the threads of its runs: of processes as many as have their cores,
+    where the user names no number; on Ray a line says what would give them room.
+    """
+    threads = max((config.threads or 1 for config in configs), default=1)
+    if isinstance(engine, Processes) and not engine.workers and threads > 1:
+        return replace(engine, workers=max(1, len(available_cores()) // threads))
+    if isinstance(engine, Ray) and engine.cpus_per_run < threads:
+        warn(
+            f"a run has {threads} threads and Ray gives it {engine.cpus_per_run:g} cores: "
+            f"--cpus-per-run {threads} gives it as many"
+        )
+    return engine
 
 
 def planned(
