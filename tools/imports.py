@@ -320,12 +320,16 @@ def _load(name: str, text: bytes | None = None, expected: str = "") -> None:
                 f"{FLAG} {name}: there is no module of that name; a file needs its .py"
             ) from error
         else:
-            why = f"it imports {error.name}, which is not installed"
+            why = f"it imports {error.name}, which is neither installed nor beside it"
         raise ValueError(f"{FLAG} {name}: {why}") from error
 
 
 def _run_file(name: str, text: bytes | None, expected: str) -> None:
-    """Import a file under a name of its own, so that two files of one name do not meet."""
+    """Import a file under a name of its own, so that two files of one name do not meet.
+
+    It finds what stands beside it, as a file that Python runs does, but behind all that is
+    installed.
+    """
     module = f"{Path(name).stem}_{hashlib.sha256(name.encode()).hexdigest()[:8]}"
     if module in sys.modules:
         return
@@ -339,6 +343,9 @@ def _run_file(name: str, text: bytes | None, expected: str) -> None:
         )
     loader = _Source(module, name, text)
     spec: Any = importlib.util.spec_from_file_location(module, name, loader=loader)
+    folder = str(Path(name).parent)
+    if folder not in sys.path:
+        sys.path.append(folder)
     sys.modules[module] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(sys.modules[module])
