@@ -172,7 +172,7 @@ def _picture(
     size, widths = _size_of(facts)
     figure, axes = style.panels(1, 1 + len(facts), size, sharey=True, width_ratios=widths)
     colours = style.agent_colours(list(agents))
-    _plot(scores, axes[0], colours)
+    _plot(scores, list(axes[0]), colours)
     title = f"{game}, {style.TWIN_NAMES[twin]}"
     style.legend_above(figure, _legend(scores, colours), 6, "outside upper right", title)
     rows = list[dict[str, Any]]()
@@ -211,7 +211,7 @@ def beliefs_figure(
     figure.set_layout_engine("constrained")
     axes = figure.subplots(1, 1 + len(facts), sharey=True, width_ratios=widths)
     colours = style.agent_colours(list(scores))
-    _plot(scores, np.ravel(axes), colours)
+    _plot(scores, list(np.ravel(axes)), colours)
     style.legend_above(figure, _legend(scores, colours), 6)
     return figure
 
