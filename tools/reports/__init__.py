@@ -401,7 +401,7 @@ def _scores(
             trouble = trouble or str(error)
     table = tables.get(metric)
     if table is not None:
-        trouble = trouble or table.trouble
+        trouble = table.trouble
     second = [tables[name] for name in tables if name != metric]
     return {
         "trouble": trouble,
