@@ -416,6 +416,7 @@ def _no_policy(model: Any) -> str:
     if isinstance(model, nn.Module):
         name = type(model).__name__
         advice = f': TensorDictModule({name}, ["pixels"], ["action_value"]) makes a policy of it'
+        advice += "; docs/measures/your-own.md says how with a recurrent state"
     return f"model must be {forms}, got {type(model).__name__}{advice}"
 
 

@@ -9,7 +9,7 @@ from torch import Tensor
 from arcade_torch import make
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
-from arcade_torch.tools import Policy, beliefs, counterfactual, patching
+from arcade_torch.tools import Policy, as_policy, beliefs, counterfactual, patching
 from arcade_torch.tools.measures.policy import outputs, policy_of, read_plain, resolve
 from tests.tools.measures.toys import Net, linear_policy
 
@@ -124,3 +124,12 @@ def test_a_state_whose_first_axis_is_not_the_batch_is_refused(layers: int) -> No
     fitting = Policy(net.encode, net.rows_first, lambda size: torch.zeros(size, layers, 8))
     assert beliefs(fitting, env, episodes=8).state_width == 8 * layers
     assert len(patching(fitting, env, episodes=8).action) == 8
+
+
+def test_a_bare_module_is_told_how_it_becomes_a_policy_with_a_recurrent_state_too() -> None:
+    """A module called as ``y, state = module(frames, state)`` that went as it was told ended inside
+    of its own convolution, on a frame without time.
+    """
+    with pytest.raises(TypeError, match=r"TensorDictModule\(GRU.*your-own.md.*state") as info:
+        as_policy(torch.nn.GRU(3, 4))
+    assert "\n" not in str(info.value)
