@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from arcade_torch.agents.checked import require
 from arcade_torch.models.flat_state import unflatten_state
 
 
@@ -33,6 +34,26 @@ def state_of(
         example = initial_state(rows)
         if isinstance(example, TensorDictBase):
             return unflatten_state(state, example)
+    return state
+
+
+def state_of_rows(state: Any, rows: int) -> Any:
+    """A recurrent state, if its first axis is the batch of so many rows.
+
+    Raises:
+        ValueError: another axis is, or it is no one tensor or TensorDict.
+    """
+    shape = getattr(state, "shape", None)
+    is_known = state is None or shape is not None
+    got = f"{list(shape)}" if shape is not None else f"a {type(state).__name__}"
+    require(
+        is_known and (shape is None or shape[:1] == (rows,)),
+        "the recurrent state",
+        got,
+        f"a TensorDict [{rows}] or a tensor [{rows}, ...], {rows} entries of the batch first, or "
+        "None: of torch's GRU, whose layers are first, take state.transpose(0, 1), and of several "
+        "tensors torch.stack(..., 1)",
+    )
     return state
 
 

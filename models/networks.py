@@ -43,6 +43,7 @@ class MemoryBlock(nn.Module):
 
     Raises:
         ValueError: unknown memory or skip, or fewer than one layer.
+        TypeError: a memory that is neither a name nor a factory.
     """
 
     def __init__(
@@ -66,6 +67,14 @@ class MemoryBlock(nn.Module):
         self.residual = skip == "residual"
         self.linear = nn.Linear(input_size, hidden_size)
         make_cell = partial(make_memory, memory) if isinstance(memory, str) else memory
+        if isinstance(memory, nn.Module) or not callable(make_cell):
+            got = repr(memory)
+            if isinstance(memory, nn.Module):
+                got = f"the {type(memory).__name__} that is made already"
+            raise TypeError(
+                "memory has to be a name, such as 'lru', or a factory that makes one of the width "
+                f"it is asked for, lambda input_size, hidden_size: ..., got {got}"
+            )
         self.cells = nn.ModuleList()
         for _ in range(layers):
             self.cells.append(make_cell(hidden_size, hidden_size, **options))

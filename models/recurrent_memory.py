@@ -54,7 +54,7 @@ class RecurrentMemory(Memory):
         hidden_size: H, features of an output step.
         run: How the module reads a chunk: ``(module, x [B, T, D], state) -> (y [B, T, H], state)``.
             None: ``module(x, state)``, with time as the first axis where ``module.batch_first`` is
-            false.
+            false; set it on a module of your own that reads so.
         start: The state at the start of an episode, as the module has it: ``(module, batch size)
             -> state``. None: zeros, where the module begins with them when it is given None, and
             does not learn what it begins with.
@@ -175,8 +175,9 @@ class RecurrentMemory(Memory):
             )
             if shapes_of(first) == shapes_of(wider):
                 raise ValueError(
-                    f"{grows}, whatever the batch: it takes time for its first axis; give what is "
-                    "inside of it batch_first=True, or exchange the axes in run="
+                    f"{grows}, whatever the batch: it takes time for its first axis; set "
+                    "batch_first = False on it, give what is inside of it batch_first=True, or "
+                    "exchange the axes in run="
                 )
             raise ValueError(
                 f"{grows}: that of a memory keeps its shape, so give it a window of fixed length; "
@@ -227,11 +228,14 @@ class RecurrentMemory(Memory):
             out = self._read(module, x, state)
         except Exception as error:
             begins_with = "a state of zeros" if self._start is None else "the state of start"
-            advice = "say how with run=lambda module, x, state: ..., and what it begins with by "
+            advice = "say how with run=lambda module, x, state: ..., "
+            if self._read is _call:
+                advice += "by batch_first = False on it, where time is its first axis, "
+            advice += "and what it begins with by start="
             raise TypeError(
                 f"{self._name} cannot be run on x {list(x.shape)} and "
                 f"{'the state None' if state is None else begins_with} ({_reason(error)}): "
-                f"{LOOP if isinstance(module, nn.RNNCellBase) else advice + 'start='}"
+                f"{LOOP if isinstance(module, nn.RNNCellBase) else advice}"
             ) from error
         is_pair = isinstance(out, (tuple, list)) and len(out) == 2
         if not is_pair or not isinstance(out[0], Tensor):

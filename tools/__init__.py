@@ -13,6 +13,7 @@ _PUBLIC = {
     "as_policy": "measures.policy",
     "Study": "studies.grid",
     "beliefs": "measures.beliefs.measure",
+    "beliefs_figure": "measures.beliefs.figure",
     "contamination": "measures.contamination.measure",
     "contamination_example": "measures.contamination.measure",
     "contamination_example_figure": "measures.contamination.example",
@@ -32,6 +33,7 @@ _PUBLIC = {
 }
 
 if TYPE_CHECKING:
+    from arcade_torch.tools.measures.beliefs.figure import beliefs_figure
     from arcade_torch.tools.measures.beliefs.measure import beliefs
     from arcade_torch.tools.measures.beliefs.patching import patching
     from arcade_torch.tools.measures.beliefs.steering import steering
@@ -57,10 +59,11 @@ if TYPE_CHECKING:
     from arcade_torch.tools.studies.runner import study
 
 __all__ = [
-    "Policy", "Study", "as_policy", "beliefs", "contamination", "contamination_example",
-    "contamination_example_figure", "contamination_figure", "counterfactual",
-    "counterfactual_figure", "gap_and_bias", "greedy_window", "patching", "recall_density",
-    "recall_density_figure", "report", "saliency", "saliency_figure", "steering", "study",
+    "Policy", "Study", "as_policy", "beliefs", "beliefs_figure", "contamination",
+    "contamination_example", "contamination_example_figure", "contamination_figure",
+    "counterfactual", "counterfactual_figure", "gap_and_bias", "greedy_window", "patching",
+    "recall_density", "recall_density_figure", "report", "saliency", "saliency_figure", "steering",
+    "study",
 ]  # fmt: skip
 
 

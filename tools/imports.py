@@ -360,21 +360,16 @@ def _load(name: str, text: bytes | None = None, expected: str = "") -> None:
                 f"{FLAG} {name}: there is no module of that name; a file needs its .py"
             ) from error
         else:
-            why = f"it imports {error.name}, which is not installed{_path_hint(name, error)}"
+            why = f"it imports {error.name}, which is neither installed nor beside it"
         raise ValueError(f"{FLAG} {name}: {why}") from error
 
 
-def _path_hint(name: str, error: ModuleNotFoundError) -> str:
-    """How a module that lies beside a file is found; empty if it lies elsewhere."""
-    folder = Path(name).parent
-    top = folder / str(error.name).partition(".")[0]
-    if not _is_file(name) or not (top.is_dir() or top.with_suffix(".py").is_file()):
-        return ""
-    return f"; it lies beside that file: set PYTHONPATH={shlex.quote(str(folder))}"
-
-
 def _run_file(name: str, text: bytes | None, expected: str) -> None:
-    """Import a file under a name of its own, so that two files of one name do not meet."""
+    """Import a file under a name of its own, so that two files of one name do not meet.
+
+    It finds what stands beside it, as a file that Python runs does, but behind all that is
+    installed.
+    """
     module = f"{Path(name).stem}_{hashlib.sha256(name.encode()).hexdigest()[:8]}"
     if module in sys.modules:
         return
@@ -386,6 +381,9 @@ def _run_file(name: str, text: bytes | None, expected: str) -> None:
     before = set(sys.modules)
     loader = _Source(module, name, text)
     spec: Any = importlib.util.spec_from_file_location(module, name, loader=loader)
+    folder = str(Path(name).parent)
+    if folder not in sys.path:
+        sys.path.append(folder)
     sys.modules[module] = importlib.util.module_from_spec(spec)
     try:
         spec.loader.exec_module(sys.modules[module])

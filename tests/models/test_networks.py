@@ -256,6 +256,20 @@ def test_a_memory_of_other_outputs_is_told_in_one_line(dtype, width, said):
         block(x, block.initial_state(2), is_init)
 
 
+@pytest.mark.parametrize("make", [make_network, make_actor_critic])
+def test_a_memory_that_is_made_already_is_no_factory(make):
+    """``TypeError: cannot unpack non-iterable int object``, from inside of it."""
+    from arcade_torch.models import make_memory
+
+    with pytest.raises(
+        TypeError, match=r"lambda input_size, hidden_size.*got the GRU that is made"
+    ) as info:
+        make("small", make_memory("gru", 128, 128))
+    assert "\n" not in str(info.value)
+    with pytest.raises(TypeError, match=r"a name, such as 'lru', or a factory .* got 3"):
+        make("small", 3)
+
+
 def test_calibration_goes_through_the_network_and_is_saved_with_it():
     pixels = inputs(4, 3, 128)[0]
     network, twin = make_network("small", "mlp"), make_network("small", "mlp")

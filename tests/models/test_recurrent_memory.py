@@ -440,6 +440,31 @@ class Inside(nn.Module):
         return self.lstm(x, state)  # type: ignore[no-any-return]
 
 
+class TimeFirst(nn.Module):
+    """Written by hand as ``nn.LSTM`` is: time first, and it needs a state."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.cell = nn.GRUCell(D, H)
+
+    def forward(self, x: Tensor, state: Any) -> tuple[Tensor, Any]:
+        outputs = []
+        for inputs in x:
+            state = self.cell(inputs, state)
+            outputs.append(state)
+        return torch.stack(outputs), state
+
+
+def start_of_time_first(module: nn.Module, batch_size: int) -> Tensor:
+    return torch.zeros(batch_size, H)
+
+
+def test_a_module_of_ones_own_says_that_time_is_its_first_axis() -> None:
+    module = TimeFirst()
+    module.batch_first = False
+    check_memory(RecurrentMemory(module, D, H, start=start_of_time_first))
+
+
 def run_by_rows(module: nn.Module, x: Tensor, state: Any) -> tuple[Tensor, Any]:
     return x, tuple(x.sum(1) for _ in x)
 
@@ -487,7 +512,16 @@ def one_of_batch(module: nn.Module, batch_size: int) -> Tensor:
             ValueError,
             "two equal calls of KeepsItsState differ.*keeps its state in itself",
         ),
-        (lambda: RecurrentMemory(Inside(), D, H), ValueError, "whatever the batch.*time for its"),
+        (
+            lambda: RecurrentMemory(Inside(), D, H),
+            ValueError,
+            "whatever the batch.*time for its.*batch_first = False on it",
+        ),
+        (
+            lambda: RecurrentMemory(TimeFirst(), D, H, start=start_of_time_first),
+            TypeError,
+            "the state of start.*batch_first = False on it, where time is its first axis",
+        ),
         (
             lambda: RecurrentMemory(nn.GRU(D, H), D, H, start=torch.zeros),
             TypeError,

@@ -71,11 +71,26 @@ def test_a_worker_process_knows_the_game_of_the_study_that_started_it() -> None:
 
 
 @pytest.mark.usefixtures("own_registry")
+def test_a_file_imports_what_stands_beside_it(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The command said that it is not installed, where ``python FILE.py`` finds it."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    (tmp_path / "model_beside.py").write_text("WIDTH = 3")
+    (tmp_path / "colorsys.py").write_text("raise ValueError('hides an installed module')")
+    monkeypatch.delitem(sys.modules, "colorsys", raising=False)
+    (tmp_path / "registers.py").write_text("import colorsys\nfrom model_beside import WIDTH\n")
+    load_extensions([str(tmp_path / "registers.py")])
+    assert sys.modules["model_beside"].WIDTH == 3
+    monkeypatch.delitem(sys.modules, "model_beside")
+
+
+@pytest.mark.usefixtures("own_registry")
 @pytest.mark.parametrize(
     ("source", "message"),
     [
         (None, "there is no such file"),
-        ("import no_such_library", "it imports no_such_library, which is not installed"),
+        ("import no_such_library", "it imports no_such_library, which is neither installed nor"),
         ("1 / 0", "it could not be imported, ZeroDivisionError: division by zero"),
         ("def", "it could not be imported, SyntaxError"),
         ("raise SystemExit(0)", "it ended the program while it was imported (SystemExit: 0)"),

@@ -288,6 +288,32 @@ def test_bias_is_measured_against_the_memory_free_agent_of_the_same_algorithm() 
     assert {row.agent: row.bias.value + 0.9 for row in table.rows} == pytest.approx(mdp)
 
 
+def test_without_a_memory_free_agent_there_are_gaps_and_no_bias(tmp_path: Path) -> None:
+    """It was refused, though a gap is of one agent; whoever names one that is missing still is."""
+    values = {("mine", "full"): [0.9, 0.8], ("mine", "partial"): [0.3, 0.4]}
+    table = gap_and_bias(scores(values), draws=10)
+    row = table.row("mine")
+    assert row.gap.value == pytest.approx(0.5) and row.gap.low <= 0.5 <= row.gap.high
+    assert math.isnan(row.bias.value)
+    assert table.baseline == "" and table.baselines == {"mine": None}
+    for baseline in ("none", "MINE-2"):
+        with pytest.raises(ValueError, match=f"memory-free agent '{baseline}', only for mine"):
+            gap_and_bias(scores(values), baseline=baseline, draws=10)
+
+    lines = ["agent,game,observability,seed,score"]
+    for score in scores(values):
+        lines.append(f"mine,{score.game},{score.observability},{score.seed},{score.value}")
+    file = tmp_path / "mine.csv"
+    file.write_text("\n".join(lines))
+    with drawing("light"):
+        drawn = figure.gap_bias(ScoreOptions(runs=[file], draws=10), None)
+        (axis,) = drawn.pictures[0].figure.axes
+        assert axis.get_title() == "Observability Gap" and len(axis.patches) == 1
+        assert any("only for mine; memory bias is against one" in note for note in drawn.notes)
+        with pytest.raises(ValueError, match="memory-free agent 'mlp', only for mine"):
+            figure.returns(ScoreOptions(runs=[file], draws=10), None)
+
+
 @pytest.mark.parametrize("name", ["gated-mlp", "mlp-mixer", "my mlp", "GATED-MLP"])
 def test_a_memory_whose_name_ends_like_the_memory_free_agent_is_none(name: str) -> None:
     """Before: it was the memory-free agent of an algorithm of its own, with a Bias of 0."""
@@ -395,7 +421,6 @@ def test_a_csv_file_with_one_run_a_line_is_read(tmp_path: Path) -> None:
             "agent,game,observability,seed,score\nmlp,X,full,0,1\nmlp,X,full,0,2\n",
             "two scores for mlp",
         ),
-        ("agent,game,observability,seed,score\nlru,X,full,0,1\n", "memory-free agent 'mlp'"),
         (
             "agent,game,observability,seed,score\nmlp,X,full,0,1\n",
             "on both twins, and gap and bias compare",

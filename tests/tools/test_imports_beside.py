@@ -141,15 +141,6 @@ def test_a_worker_refuses_another_text_than_its_study_began_with(
         imports.load_extensions()
 
 
-def test_a_module_beside_a_file_that_is_not_found_is_told_how(
-    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sys, "path", [path for path in sys.path if path != str(folder)])
-    assert cli.main(["list", "--import", str(folder / "yours.py")]) == cli.EXIT_BAD_INPUT
-    said = capsys.readouterr().err
-    assert said.endswith(f"it lies beside that file: set PYTHONPATH={folder}\n"), said
-
-
 def test_what_a_run_says_of_modules_beside_is_not_opened(folder: Path) -> None:
     """It may come from somebody else."""
     entry = {"name": str(folder / "pipe"), "sha256": "0" * 64, "by": str(folder / "yours.py")}

@@ -108,12 +108,17 @@ def test_an_unfinished_study_is_reported_as_such(tmp_path: Path, no_oracles: Non
     assert "1 of 8 runs have not finished" in report(tmp_path / "s", skip=("saliency",)).read_text()
 
 
-def test_a_study_without_the_control_still_has_a_page(tmp_path: Path, no_oracles: None) -> None:
-    write_study(tmp_path / "s", small_study(memories=["mingru"]))
-    assert (
-        "no scores for the memory-free agent"
-        in report(tmp_path / "s", skip=("saliency",)).read_text()
-    )
+def test_a_study_without_the_control_has_gaps_and_no_bias(tmp_path: Path, no_oracles: None) -> None:
+    folder = write_study(tmp_path / "s", small_study(memories=["mingru"], subject="mingru"))
+    # too short for a training score: the table of the other metric has no reason of its own here
+    file = next(folder.root.glob("runs/*/eval.json"))
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"train_max_ewm": None}))
+    (file.parent / "metrics.csv").write_text("frames,train_return_ewm\n2048,\n")
+    page = report(tmp_path / "s", skip=("saliency",)).read_text()
+    assert "no scores for the memory-free agent" in page and "not known yet" not in page
+    assert "has no train_max_ewm" not in page
+    assert ">Observability Gap<" in page and ">Memory Bias<" not in page
+    assert (tmp_path / "s" / "analysis" / "gap_bias_eval_final.csv").is_file()
 
 
 def test_agents_are_told_about_beside_the_memory_free_one_of_their_algorithm(

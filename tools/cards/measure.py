@@ -2,6 +2,7 @@
 
 import inspect
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import torch
 
 import arcade_torch
-from arcade_torch.models import law_results, make_memory
+from arcade_torch.models import RecurrentMemory, law_results, make_memory
 from arcade_torch.models.generators import kept_generators
 from arcade_torch.models.presets import PRESETS
 from arcade_torch.models.registry import is_built_in
@@ -89,9 +90,16 @@ def measure_card(name: str, tests: bool = True, tell: Tell = lambda part: None) 
 
 
 def _about(memory: torch.nn.Module) -> str:
-    """What the file of a memory model, or else its class, says in its first paragraph."""
+    """What the file of a memory model, or else its class, says in its first paragraph; of a module
+    of another library what its class says.
+    """
     kind = type(memory)
     text = getattr(inspect.getmodule(kind), "__doc__", None) or kind.__doc__ or ""
+    if isinstance(memory, RecurrentMemory):
+        kind = type(memory.module)
+        text = kind.__doc__ or kind.__name__
+        # those of torch begin with the arguments
+        text = re.sub(r"^\s*__init__\(.*?\)\n\n", "", text, flags=re.DOTALL)
     return " ".join(text.strip().partition("\n\n")[0].replace("``", "").split())
 
 

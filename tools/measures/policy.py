@@ -31,7 +31,7 @@ from tensordict import unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from arcade_torch.agents.forward import evaluating, state_of
+from arcade_torch.agents.forward import evaluating, state_of, state_of_rows
 from arcade_torch.models.actor_critic import ActorCriticNetwork
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.tools.measures.frames import float_type, floats_are_taken
@@ -62,7 +62,7 @@ class Policy:
     features [N, E], each frame on its own. ``remember`` is ``(features [B, T, E], last_action int64
     [B, T], is_init bool [B, T], state) -> (out [B, T, A], state)``, causal in time;
     ``initial_state`` gives, for a batch size, the state before the first frame: a TensorDict [B], a
-    tensor [B, ...] or None.
+    tensor [B, ...] (that of ``torch.nn.GRU`` has its layers first) or None.
     """
 
     encode: Callable[[Tensor], Tensor]
@@ -98,12 +98,12 @@ class Policy:
             if self.step is not None:
                 action, state = self.step(obs, state)
                 return action, {}, state
-            steps = obs["pixels"].shape[0], 1
+            rows = obs["pixels"].shape[0]
             features = self.encode(obs["pixels"]).unsqueeze(1)
-            out, state = self.remember(
-                features, obs["last_action"].reshape(steps), obs["is_init"].reshape(steps), state
-            )
-            return self.greedy(out[:, 0]), {}, state
+            actions = obs["last_action"].reshape(rows, 1)
+            flags = obs["is_init"].reshape(rows, 1)
+            out, state = self.remember(features, actions, flags, state_of_rows(state, rows))
+            return self.greedy(out[:, 0]), {}, state_of_rows(state, rows)
 
     @torch.no_grad()
     def features(
@@ -152,11 +152,11 @@ class Policy:
             last_action = self.no_actions(batch, features.device)
         if is_init is None:
             is_init = torch.zeros(batch, dtype=torch.bool, device=features.device)
-        state = state_of(state, self.initial_state, batch[0])
+        state = state_of_rows(state_of(state, self.initial_state, batch[0]), batch[0])
         name = resolve(self, target)
         with self.evaluating():
             out, state = self.remember(features, last_action, is_init.bool(), state)
-        return self.read(out, name), state
+        return self.read(out, name), state_of_rows(state, batch[0])
 
     def forward_frames(
         self,
@@ -305,6 +305,8 @@ def as_policy(model: Any, **names: Unpack[Names]) -> Policy:
     network = getattr(model, "network", model)
     if isinstance(model, Policy):
         policy = model
+        for rows in (1, 2):
+            state_of_rows(policy.initial_state(rows), rows)
     elif isinstance(model, tuple) and len(model) == 2 and all(callable(part) for part in model):
         policy = Policy(model[0], model[1])
     elif all(hasattr(network, name) for name in ("encode", "remember", "initial_state")):
@@ -414,6 +416,7 @@ def _no_policy(model: Any) -> str:
     if isinstance(model, nn.Module):
         name = type(model).__name__
         advice = f': TensorDictModule({name}, ["pixels"], ["action_value"]) makes a policy of it'
+        advice += "; docs/measures/your-own.md says how with a recurrent state"
     return f"model must be {forms}, got {type(model).__name__}{advice}"
 
 

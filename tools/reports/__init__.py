@@ -189,7 +189,7 @@ def _subject_part(
     """
     if not about:
         return None
-    rival = "" if table is None else str(table.baselines[about])
+    rival = "" if table is None else table.baselines[about] or ""
     return subject_section(folder, runs, about, metric, rival)
 
 
@@ -400,6 +400,8 @@ def _scores(
         except ValueError as error:
             trouble = trouble or str(error)
     table = tables.get(metric)
+    if table is not None:
+        trouble = table.trouble
     second = [tables[name] for name in tables if name != metric]
     return {
         "trouble": trouble,

@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
+from arcade_torch.tools.imports import is_from_user
 from arcade_torch.tools.names import bare_name
 
 Results = Mapping[str, Any]
@@ -52,7 +53,7 @@ model-index:
 Mean greedy return **{value}** over {results["n_eval_episodes"]:,} episodes on held-out seeds, after
 {results["frames"]:,} frames of training from seed {results["seed"]}. Trained with arcade-torch,
 which is POPGym Arcade for PyTorch.
-{film}
+{film}{_registered(results["memory"])}
 ```python
 from arcade_torch.agents import evaluate, from_pretrained
 
@@ -65,6 +66,16 @@ print(evaluate(agent).text)
 
 `config.json` has all settings of the training, `results.json` how it was made and measured.
 """
+
+
+def _registered(memory: str) -> str:
+    """What to do before the agent is loaded, where its memory is none of this package."""
+    if not is_from_user(memory):
+        return ""
+    return (
+        f"\nIts memory is none of that package, and no code comes with it: import what calls\n"
+        f"`register_memory({_scalar(memory)}, ...)` first, with a command by `--import FILE.py`.\n"
+    )
 
 
 def eval_results(results: Results) -> str:

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from arcade_torch.models import (
+    RecurrentMemory,
     check_memory,
     law_results,
     make_memory,
@@ -226,3 +227,15 @@ def test_a_card_with_a_study_says_what_was_trained(
 def test_every_built_in_memory_has_an_about_line() -> None:
     for name in memory_names():
         assert len(measure._about(make_memory(name, 8, 16))) > 10
+
+
+class TwoTraces(nn.GRU):
+    """A fast and a slow trace.
+
+    More about it.
+    """
+
+
+def test_a_recurrent_module_is_told_of_in_its_own_words() -> None:
+    """The page said of it what ``RecurrentMemory`` says of itself."""
+    assert measure._about(RecurrentMemory(TwoTraces(8, 16), 8, 16)) == "A fast and a slow trace."

@@ -7,7 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from arcade_torch import make
+from arcade_torch.models import make_network
 from arcade_torch.tools import (
+    beliefs,
+    beliefs_figure,
     contamination,
     contamination_example,
     contamination_example_figure,
@@ -72,6 +76,24 @@ def test_contamination_has_a_panel_for_each_strength() -> None:
     assert [axis.get_title() for axis in figure.axes] == ["noise sigma = 0.3", "noise sigma = 1"]
     drawn = figure.axes[1].lines[0].get_ydata()
     np.testing.assert_allclose(drawn, changes.mean("change")[1])
+
+
+def test_beliefs_have_bars_of_all_facts_and_a_panel_for_each() -> None:
+    env = make("MineSweeperEasy", num_envs=8, observability="partial", seed=0)
+    seeds = []
+    for memory in ("gru", "mlp"):
+        seeds.append(beliefs(make_network("small", memory), env, episodes=16, max_steps=4))
+    figure = beliefs_figure({"GRU": seeds[0], "both": [seeds[0], seeds[0]], "none": seeds[1]})
+    figure.canvas.draw()
+    facts = seeds[0].names.tolist()
+    assert [axis.get_title() for axis in figure.axes] == ["all steps", *facts]
+    heights = [bar.get_height() for bar in figure.axes[0].patches[:2]]
+    sources = ("state", "frame")
+    scores = [max(seeds[0].score(facts[0], source).value, -0.15) for source in sources]
+    assert heights == pytest.approx(scores)
+    drawn = figure.axes[1].lines[0].get_ydata()
+    np.testing.assert_allclose(drawn, seeds[0].by_step(facts[0], "state")[0])
+    assert len(beliefs_figure({"none": seeds[1]}).axes[1].lines) == 2  # the frame, and zero
 
 
 def test_an_example_has_bars_for_as_many_actions_as_there_are() -> None:
@@ -148,6 +170,7 @@ def test_what_cannot_be_drawn_is_refused_in_one_line() -> None:
         ),
         (lambda: counterfactual_figure({}), "effects must be of one policy at least"),
         (lambda: counterfactual_figure({"a": exchanges}, effect="x"), "effect must be one of flip"),
+        (lambda: beliefs_figure({}), "probes must be of one policy at least"),
         (lambda: recall_density_figure({}), "densities must be of one policy at least"),
         (lambda: saliency_figure([]), "rows must be one at least"),
         (lambda: saliency_figure([("a", frames, maps)], show=0), "show must be at least 1"),

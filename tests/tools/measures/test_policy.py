@@ -1,12 +1,15 @@
 """What counts as a policy, and how its outputs are read."""
 
+from typing import Any
+
 import pytest
 import torch
 from torch import Tensor
 
+from arcade_torch import make
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
-from arcade_torch.tools import Policy
+from arcade_torch.tools import Policy, as_policy, beliefs, counterfactual, patching
 from arcade_torch.tools.measures.policy import outputs, policy_of, read_plain, resolve
 from tests.tools.measures.toys import Net, linear_policy
 
@@ -74,3 +77,59 @@ def test_what_is_no_policy_is_refused() -> None:
     ):
         outputs(linear_policy(0.5), "Q")
     assert policy_of(Policy(encode, lambda e, a, s, h: (e, h))).read is read_plain
+
+
+class TorchGRU:
+    """Two functions around ``torch.nn.GRU``, whose state is [layers, N, H]."""
+
+    def __init__(self, layers: int) -> None:
+        torch.manual_seed(0)
+        self.gru = torch.nn.GRU(6 * 6 * 3, 8, num_layers=layers, batch_first=True)
+        self.head = torch.nn.Linear(8, 5)
+        self.layers = layers
+
+    def encode(self, frames: Tensor) -> Tensor:
+        return frames[..., ::24, ::24, :].float().flatten(1) / 255
+
+    def layers_first(self, features: Tensor, last: Tensor, begins: Tensor, state: Any) -> Any:
+        y, state = self.gru(features, state)
+        return self.head(y), state
+
+    def rows_first(self, features: Tensor, last: Tensor, begins: Tensor, state: Tensor) -> Any:
+        y, state = self.gru(features, state.transpose(0, 1).contiguous())
+        return self.head(y), state.transpose(0, 1)
+
+    def in_a_tuple(self, features: Tensor, last: Tensor, begins: Tensor, state: Any) -> Any:
+        y, state = self.gru(features, None if state is None else state[0])
+        return self.head(y), (state, state)
+
+    def start(self, size: int) -> Tensor:
+        return torch.zeros(self.layers, size, 8)
+
+
+@pytest.mark.parametrize("layers", [1, 2, 4])
+def test_a_state_whose_first_axis_is_not_the_batch_is_refused(layers: int) -> None:
+    """Beliefs read states of two layers as those of other envs, without a word; others ended in an
+    IndexError of torch.
+    """
+    net = TorchGRU(layers)
+    env = make("SignpostEasy", num_envs=4, observability="partial", seed=0)
+    starts_with_layers = Policy(net.encode, net.layers_first, net.start)
+    refused = [(net.encode, net.layers_first), starts_with_layers, (net.encode, net.in_a_tuple)]
+    for policy in refused:
+        for measure in (beliefs, patching, counterfactual):
+            with pytest.raises(ValueError, match=r"\[\d, ...\], .*state.transpose\(0, 1\)") as info:
+                measure(policy, env, episodes=8)
+            assert "\n" not in str(info.value)
+    fitting = Policy(net.encode, net.rows_first, lambda size: torch.zeros(size, layers, 8))
+    assert beliefs(fitting, env, episodes=8).state_width == 8 * layers
+    assert len(patching(fitting, env, episodes=8).action) == 8
+
+
+def test_a_bare_module_is_told_how_it_becomes_a_policy_with_a_recurrent_state_too() -> None:
+    """A module called as ``y, state = module(frames, state)`` that went as it was told ended inside
+    of its own convolution, on a frame without time.
+    """
+    with pytest.raises(TypeError, match=r"TensorDictModule\(GRU.*your-own.md.*state") as info:
+        as_policy(torch.nn.GRU(3, 4))
+    assert "\n" not in str(info.value)

@@ -15,6 +15,7 @@ from arcade_torch.tools import cli
 from arcade_torch.tools.commands.share import is_folder
 from arcade_torch.tools.commands.train import _read_config
 from arcade_torch.tools.sharing import share
+from arcade_torch.tools.sharing.card import model_card
 from tests.tools.test_cli import one_error
 
 NEEDED = {"config.json", "model.safetensors", "README.md", "results.json", ".eval_results"}
@@ -80,6 +81,16 @@ def test_a_command_that_is_shared_names_no_place_and_repeats_the_run(
     words: list[str], said: str
 ) -> None:
     assert share._command({"command": words}) == said
+
+
+def test_the_page_of_a_memory_of_ones_own_says_that_it_has_to_be_registered(pushed: Path) -> None:
+    """Its example ended in an error for everybody else."""
+    results = json.loads((pushed / "results.json").read_text())
+    assert "register" not in (pushed / "README.md").read_text()
+    page = model_card("shared", results | {"memory": "two_traces"}, "")
+    assert 'register_memory("two_traces", ...)' in page
+    for ours in ("lru", "feedforward"):
+        assert "register" not in model_card("shared", results | {"memory": ours}, "")
 
 
 def test_the_model_card_is_yaml_that_boards_read(pushed: Path) -> None:

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from arcade_torch.agents.checked import require
+from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.files import Table
 from arcade_torch.tools.measures.beliefs import BeliefsOptions, measure
@@ -167,20 +169,65 @@ def _picture(
     """The figure of one task: bars of all facts, and a panel a fact over the steps."""
     scores = {agent: scores_of(seeds, options.confidence) for agent, seeds in agents.items()}
     facts = facts_of(scores)
-    size = (max(9.5, 4.2 + 2.9 * len(facts)), 3.6)  # room for title and legend
-    widths = [1.4, *[1.0] * len(facts)]
+    size, widths = _size_of(facts)
     figure, axes = style.panels(1, 1 + len(facts), size, sharey=True, width_ratios=widths)
     colours = style.agent_colours(list(agents))
-    plot_bars(scores, axes[0, 0], colours)
-    axes[0, 0].set_ylabel("score: 0 a guess, 1 perfect")
-    for fact, axis in zip(facts, axes[0, 1:], strict=True):
-        plot_steps(scores, fact, axis, colours)
+    _plot(scores, list(axes[0]), colours)
     title = f"{game}, {style.TWIN_NAMES[twin]}"
     style.legend_above(figure, _legend(scores, colours), 6, "outside upper right", title)
     rows = list[dict[str, Any]]()
     for agent, of_agent in scores.items():
         rows += _rows(agent, game, twin, len(agents[agent]), of_agent)
     return Picture(f"beliefs-{game}-{twin}", figure, _note(agents, options), rows)
+
+
+def beliefs_figure(
+    probes: Mapping[str, measure.Beliefs | Sequence[measure.Beliefs]],
+    *,
+    confidence: float = 0.95,
+    figure: Any = None,
+) -> Any:
+    """Draw what can be read off states and off frames: bars of all facts over all steps, and a
+    panel a fact step by step.
+
+    Args:
+        probes: by name what `beliefs` gave, or that of several seeds; intervals are over seeds, or
+            over the scored episodes of a single one.
+        confidence: of the intervals, in (0, 1).
+        figure: an empty figure to draw into; a new one of ``matplotlib.pyplot`` by default.
+
+    Returns:
+        A matplotlib figure.
+    """
+    require(len(probes) > 0, "probes", dict(probes), "of one policy at least")
+    scores = dict[str, OfAgent]()
+    for name, given in probes.items():
+        seeds = [given] if isinstance(given, measure.Beliefs) else given
+        scores[name] = scores_of(seeds, confidence)
+    facts = facts_of(scores)
+    size, widths = _size_of(facts)
+    figure = need("matplotlib.pyplot").figure() if figure is None else figure
+    figure.set_size_inches(*size)
+    figure.set_layout_engine("constrained")
+    axes = figure.subplots(1, 1 + len(facts), sharey=True, width_ratios=widths)
+    colours = style.agent_colours(list(scores))
+    _plot(scores, list(np.ravel(axes)), colours)
+    style.legend_above(figure, _legend(scores, colours), 6)
+    return figure
+
+
+def _size_of(facts: Sequence[str]) -> tuple[tuple[float, float], list[float]]:
+    """Inches of the figure of so many facts, and the widths of its panels."""
+    wide = max(9.5, 4.2 + 2.9 * len(facts))  # room for title and legend
+    return (wide, 3.6), [1.4, *[1.0] * len(facts)]
+
+
+def _plot(scores: Mapping[str, OfAgent], axes: Sequence[Any], colours: Mapping[str, str]) -> None:
+    """Bars of all facts in the first of the axes, and a fact in each of the others."""
+    plot_bars(scores, axes[0], colours)
+    axes[0].set_ylabel("score: 0 a guess, 1 perfect")
+    for fact, axis in zip(facts_of(scores), axes[1:], strict=True):
+        plot_steps(scores, fact, axis, colours)
 
 
 def facts_of(scores: Mapping[str, OfAgent]) -> list[str]:

@@ -69,10 +69,13 @@ LINE = 0.16
 
 
 def gap_bias(options: ScoreOptions, progress: Progress | None) -> Made:
-    """The figure ``gap-bias``: right and down is better."""
+    """The figure ``gap-bias``: right and down is better; without any Bias, the gaps alone."""
     result, table, note = _table(options)
     figure, axes = panels(1, 1, (7.4, 5.4))
-    plot(table.rows, axes[0, 0])
+    if table.baseline:
+        plot(table.rows, axes[0, 0])
+    else:
+        plot_bars(table.rows, axes[0, 0], "gap")
     result.pictures = [Picture("gap-bias", figure, note, table.table())]
     return result
 
@@ -82,6 +85,7 @@ def returns(options: ScoreOptions, progress: Progress | None) -> Made:
     time).
     """
     result, table, note = _table(options)
+    table.check_bias()
     agents = len(table.rows)
     if agents <= MOST_BESIDE:
         figure, axes = panels(1, 3, (12.5, 4.2))
@@ -104,7 +108,9 @@ def size_sweep(options: SweepOptions, progress: Progress | None) -> Made:
     tables = dict[str, GapBias]()
     for game, scores in _scores_by_game(runs, options).items():
         try:
-            tables[game] = _computed(scores, options)
+            table = _computed(scores, options)
+            table.check_bias()
+            tables[game] = table
         except ValueError as error:
             notes.append(f"left out, {game}: {error}")
     if not tables:
@@ -355,6 +361,8 @@ def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
             f"left out, of no single twin: {mixed} score{'s' * (mixed > 1)} "
             f"({' or '.join(BOTH_TWINS)})"
         )
+    if table.trouble:
+        notes.append(table.trouble)
     if table.dropped:
         notes.append(f"left out, some agent lacks one of its twins: {', '.join(table.dropped)}")
     wide = tasks_out_of_range(scores, table.tasks)

@@ -26,6 +26,8 @@ from arcade_torch.tools.names import find_baselines, named_like
 from arcade_torch.tools.runs import Score
 from arcade_torch.tools.scores import Source, read_scores
 
+MEMORY_FREE = "mlp"
+"""The memory-free agent, where none is named."""
 TWINS = ("full", "partial")
 BOTH_TWINS = ("mixed", "both")
 NUMBERS = ("mdp_raw", "pomdp_raw", "mdp", "pomdp", "gap", "bias", "mdp_iqm", "pomdp_iqm")
@@ -106,13 +108,23 @@ class GapBias:
     tasks: tuple[str, ...]
     dropped: tuple[str, ...]  # environment ids left out because some agent lacks them
     metric: str  # what the score of a run is
-    baseline: str  # the memory-free agent, of several algorithms the first
+    baseline: str  # the memory-free agent, of several algorithms the first; empty if there is none
     baselines: Mapping[str, str | None]  # agent -> the memory-free agent of its algorithm
     confidence: float  # nominal, of the intervals
     draws: int  # of the bootstrap
     # rows leaving out one game, all its difficulties; empty for one game
     without: Mapping[str, tuple[AgentRow, ...]]
     _values: Mapping[str, Mapping[str, Array]] = field(repr=False)
+
+    @property
+    def trouble(self) -> str:
+        """Why no agent has a Bias; empty where there is a memory-free one."""
+        return "" if self.baseline else _without_baseline(list(self.baselines), MEMORY_FREE)
+
+    def check_bias(self) -> None:
+        """Raise ValueError if no agent has a Bias."""
+        if self.trouble:
+            raise ValueError(self.trouble)
 
     def row(self, agent: str) -> AgentRow:
         """The row of an agent."""
@@ -163,7 +175,7 @@ def gap_and_bias(
     runs: Source,
     *,
     metric: str = "eval_final",
-    baseline: str = "mlp",
+    baseline: str = MEMORY_FREE,
     draws: int = 10_000,
     confidence: float = 0.95,
     seed: int = 0,
@@ -179,6 +191,7 @@ def gap_and_bias(
             `arcade_torch.tools.runs.read_scores`.
         metric: ``eval_final`` (greedy) or ``train_max_ewm`` (the paper's).
         baseline: the memory-free agent (any case); that of one algorithm, ``pqn-mlp``, serves all.
+            Without any ``mlp`` there are gaps and no Bias; another name has to be there.
         draws: bootstrap draws.
         confidence: of the intervals, in (0, 1).
         seed: of the draws.
@@ -206,7 +219,7 @@ def gap_and_bias(
         tasks=tuple(tasks),
         dropped=tuple(game for game in games if game not in tasks),
         metric=metric,
-        baseline=rows[0].agent,
+        baseline=rows[0].agent if any(baselines.values()) else "",
         baselines=baselines,
         confidence=confidence,
         draws=draws,
@@ -244,17 +257,22 @@ def _baselines(cells: Cells, baseline: str) -> dict[str, str | None]:
     """The memory-free agent of every agent, or None; memory-free agents come first."""
     agents = list(dict.fromkeys(agent for agent, _, _ in cells))
     memory_free = find_baselines(agents, baseline)
-    if not memory_free:
-        alike = [agent for agent in agents if named_like(agent, baseline)]
-        advice = f"train --memory {baseline} on the same games and both twins"
-        if alike:
-            advice = f"name it, --baseline {alike[0]}, if that is one, or {advice}"
-        raise ValueError(
-            f"no scores for the memory-free agent {baseline!r}, only for "
-            f"{', '.join(agents) or 'nobody'}; the gap and the bias of a memory are against one: "
-            f"{advice}"
-        )
+    alike = any(named_like(agent, baseline) for agent in agents)
+    if not memory_free and (alike or not agents or baseline != MEMORY_FREE):
+        raise ValueError(_without_baseline(agents, baseline))
     return {agent: memory_free.get(agent) for agent in [*memory_free.values(), *agents]}
+
+
+def _without_baseline(agents: Sequence[str], baseline: str) -> str:
+    """Say that nobody is the memory-free agent, and what to do."""
+    advice = f"train --memory {baseline} on the same games and both twins"
+    alike = [agent for agent in agents if named_like(agent, baseline)]
+    if alike:
+        advice = f"name it, --baseline {alike[0]}, if that is one, or {advice}"
+    return (
+        f"no scores for the memory-free agent {baseline!r}, only for "
+        f"{', '.join(agents) or 'nobody'}; memory bias is against one: {advice}"
+    )
 
 
 def _is_complete(game: str, cells: Cells, agents: Iterable[str]) -> bool:
