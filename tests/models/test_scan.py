@@ -201,6 +201,8 @@ def test_vmap_equals_a_python_loop_values_and_gradients(dtype):
         a[:2], b.unflatten(0, (2, 2)), start[:2], h0[:2]
     )
     torch.testing.assert_close(some[1], linear_scan(a[:2], b[2:], start[:2], h0[:2]))
+    last = [x.movedim(0, -1) for x in batched]
+    torch.testing.assert_close(torch.vmap(linear_scan, in_dims=-1)(*last), mapped)
 
     leaves = [x.clone().requires_grad_() for x in (a, b, h0)]
     plain = torch.autograd.grad(

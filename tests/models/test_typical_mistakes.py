@@ -381,6 +381,18 @@ class SignsOfBefore(Cell):
         return super().initial_state(batch_size).set("signs", signs)
 
 
+class MasksWhatItReads(Cell):
+    """At a start it does not read the state, which stays in place for the next step."""
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        h = state["h"]
+        outputs = []
+        for t, inputs in enumerate(self.read(x).unbind(1)):
+            h = 0.9 * h + inputs
+            outputs.append(torch.where(is_init[:, t, None], inputs, h))
+        return torch.stack(outputs, 1), self.state_of(h)
+
+
 class GradientOfBefore(Cell):
     """What is forgotten at a start counts nothing, and gets a gradient."""
 
@@ -643,6 +655,7 @@ def test_passed_until_it_was_trained(model: type[Cell], law: str, said: str) -> 
         (HasEmptySlots, "scan equals step by step", "not the one after the last step"),
         (CentredOverTime, "scan equals step by step", "a look into the future"),
         (BeyondItsWindow, "several calls equal one", "11 steps in one call and in calls cut at"),
+        (MasksWhatItReads, "packed equals apart", "does not restore initial_state"),
         (SignsOfBefore, "packed equals apart", "does not restore initial_state"),
         (UnreadTrace, "nothing leaks over a start", "a NaN in the carried state comes through"),
         (ReadsTheStepBefore, "nothing leaks over a start", "a NaN in the carried state comes"),
