@@ -46,6 +46,8 @@ class Subject:
     input_size: int
     dtype: torch.dtype
     tolerance: float
+    original: nn.Module
+    """A copy in evaluation mode whose weights and buffers are of the types that they came in."""
 
     def random(self, batch: int, steps: int) -> Tensor:
         """Random x [batch, steps, D] where the parameters are."""
@@ -70,6 +72,21 @@ class Subject:
         """The same, with a copy of the module, for calls that may leave something in it."""
         return replace(self, module=copy_of(self.module))
 
+    def unconverted(self) -> "Subject":
+        """The same in the type that the weights came in."""
+        for weight in (*self.original.parameters(), *self.original.buffers()):
+            if weight.is_floating_point() or weight.is_complex():
+                return replace(self, module=self.original, dtype=weight.dtype.to_real())
+        return self
+
+    def read_steps(self, x: Tensor, state: TensorDict, flags: Tensor) -> tuple[Tensor, TensorDict]:
+        """What the module gives of a chunk, one call a step."""
+        outputs = []
+        for t in range(x.shape[1]):
+            y, state = self.module(x[:, t : t + 1], state, flags[:, t : t + 1])
+            outputs.append(y)
+        return torch.cat(outputs, dim=1), state
+
     def initial(self, batch: int) -> TensorDict:
         """The state at the start of an episode, TensorDict [batch]."""
         return self.module.initial_state(batch)  # type: ignore[operator]
@@ -83,7 +100,9 @@ class Subject:
         tolerance: float | None = None,
     ) -> float:
         """Largest difference of the pairs; raises if above the tolerance or not a number."""
-        worst = max((_difference(p, q) for p, q in pairs if p.numel()), default=0.0)
+        differences = [_difference(p, q) for p, q in pairs if p.numel()]
+        # torch's maximum is NaN where one of them is, unlike Python's
+        worst = float(torch.tensor([0.0, *differences], dtype=torch.float64).max())
         if not worst <= (self.tolerance if tolerance is None else tolerance):
             raise MemoryLawError(law, f"{symptom} (largest difference {worst:.2g})", cause, worst)
         return worst
@@ -123,7 +142,7 @@ def subject_of(
     convert = partial(_in_precision, dtype=dtype)
     checked = copy_of(module, convert).eval()
     checked._apply(convert)
-    return Subject(checked, size, dtype, tolerance)
+    return Subject(checked, size, dtype, tolerance, original=copy_of(module).eval())
 
 
 def copy_of(module: nn.Module, convert: Callable[[Tensor], Tensor] = torch.detach) -> nn.Module:
@@ -162,14 +181,17 @@ def _in_precision(tensor: Tensor, dtype: torch.dtype) -> Tensor:
 
 
 def _difference(p: Tensor, q: Tensor) -> float:
-    """Largest difference, as a share of the largest entry where that is above 1: sums over many
-    steps are large, and so is their rounding. Computed in float64.
+    """Largest difference, as a share of the largest finite entry where that is above 1: sums over
+    many steps are large, and so is their rounding. Equal infinities do not differ. Computed in
+    float64.
     """
     wide = torch.complex128 if p.is_complex() else torch.float64
     p = p.to(wide)
     q = q.to(wide)
-    size = q.abs().max().clamp_min(1.0)
-    return float((p - q).abs().max() / size)
+    difference = (p - q).abs().masked_fill(p == q, 0)
+    sizes = q.abs()
+    size = sizes.masked_fill(~sizes.isfinite(), 0).max().clamp_min(1.0)
+    return float(difference.max() / size)
 
 
 def leaves(state: TensorDict) -> dict[tuple[str, ...], Tensor]:

@@ -6,6 +6,13 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from arcade_torch.models.generators import kept_generators
+from arcade_torch.models.law_gradients import (
+    compare_gradients,
+    gradients_are_right,
+    gradients_of,
+    gradients_of_steps,
+)
 from arcade_torch.models.law_subject import MemoryLawError, Subject, leaves, pairs_of
 from arcade_torch.models.law_weights import weights_are_registered
 from arcade_torch.models.memory import ReplayableMemory, replay_by_steps
@@ -22,6 +29,7 @@ Law = Callable[[Subject, str], float]
 def _shapes(s: Subject, law: str) -> float:
     for batch, steps in ((1, 1), (3, 1), (2, 5)):
         _check_one_shape(s, law, batch, steps)
+    _check_original(s, law)
     copied = s.copied()
     x, state, flags = copied.inputs(2, 5, 0.3)
     flags[0, 0] = True
@@ -75,6 +83,26 @@ def _check_one_shape(s: Subject, law: str, batch: int, steps: int) -> None:
     _check_states(s, law, batch, begin, after)
 
 
+def _check_original(s: Subject, law: str) -> None:
+    """The same in the type that the weights came in: float64 hides constants of float64."""
+    original = s.unconverted()
+    if s.dtype != torch.float64 or original.dtype == s.dtype:
+        return
+    try:
+        with kept_generators():  # the numbers that later laws draw stay what they are
+            _check_one_shape(original, law, 2, 5)
+    except MemoryLawError:
+        raise
+    except Exception as error:
+        raise MemoryLawError(
+            law,
+            f"with weights of {original.dtype} it fails, {type(error).__name__} "
+            f"{' '.join(str(error).split())}",
+            "numbers of float64 in it, such as a constant of numpy or a .double(): give them the "
+            "type of x or of the weights",
+        ) from error
+
+
 def _check_states(s: Subject, law: str, batch: int, begin: TensorDict, after: TensorDict) -> None:
     """Batch size, shapes and dtypes of the first state and of one that forward returned."""
     for source, state in ((f"initial_state({batch})", begin), ("forward", after)):
@@ -126,8 +154,10 @@ def _calls_repeat(s: Subject, law: str) -> float:
     worst = s.compare(law, symptom, cause, *pairs_of(s.initial(3), s.initial(3)))
     copied = s.copied()
     x, state, flags = copied.inputs(3, 5, 0.3)
+    generator = torch.get_rng_state()
     y, after = copied.module(x, state, flags)
     again, after_again = copied.module(x, state, flags)
+    moves_generator = not torch.equal(generator, torch.get_rng_state())
     repeated = s.compare(
         law,
         "the same call twice differs",
@@ -136,6 +166,13 @@ def _calls_repeat(s: Subject, law: str) -> float:
         (y, again),
         *pairs_of(after, after_again),
     )
+    if moves_generator:
+        raise MemoryLawError(
+            law,
+            "a call changes the state of torch's random generator",
+            "torch.manual_seed in forward, after which exploration draws the same numbers at every "
+            "step, or numbers that are drawn for nothing: draw in __init__, into a buffer",
+        )
     training = s.copied().module.train()
     trained, after_trained = training(x, state, flags)
     once_more, after_once_more = training(x, state, flags)
@@ -162,15 +199,6 @@ def _calls_repeat(s: Subject, law: str) -> float:
     )
 
 
-def _steps(s: Subject, x: Tensor, state: TensorDict, flags: Tensor) -> tuple[Tensor, TensorDict]:
-    """The same chunk, one call a step."""
-    outputs = []
-    for t in range(x.shape[1]):
-        y, state = s.module(x[:, t : t + 1], state, flags[:, t : t + 1])
-        outputs.append(y)
-    return torch.cat(outputs, dim=1), state
-
-
 @torch.no_grad()
 def _scan_equals_steps(s: Subject, law: str) -> float:
     worst = 0.0
@@ -178,7 +206,7 @@ def _scan_equals_steps(s: Subject, law: str) -> float:
         for resets in (0.0, 0.3):
             x, state, flags = s.inputs(3, steps, resets)
             y, after = s.module(x, state, flags)
-            stepped, stepped_after = _steps(s, x, state, flags)
+            stepped, stepped_after = s.read_steps(x, state, flags)
             symptom = (
                 f"one call over T={steps} steps {'with' if resets else 'without'} resets and T "
                 "calls of one differ"
@@ -258,11 +286,7 @@ def _no_leak(s: Subject, law: str) -> float:
     carried = [v.requires_grad_() for v in leaves(state).values() if v.is_floating_point()]
     x.requires_grad_()
     y, _ = s.module(x, state, flags)
-    if not y.requires_grad:
-        raise MemoryLawError(
-            law, "no gradient comes from y to x", "torch.no_grad, a detach or .data in forward"
-        )
-    grads = _gradients_of(law, y[:, 4:].sum(), [x, *carried])
+    grads = gradients_of(law, y[:, 4:].sum(), [x, *carried])
     earlier = [grads[0][:, :4], *grads[1:]]
     worst = s.compare(
         law,
@@ -310,21 +334,37 @@ def _rows_independent(s: Subject, law: str) -> float:
     return worst
 
 
-@torch.no_grad()
 def _replay_loads(s: Subject, law: str) -> float:
     x, _, flags = s.inputs(3, 9, 0.3)
     stored = torch.stack([s.inputs(3, 1)[1] for _ in range(9)], dim=1)
-    y, states = s.module.replay(x, stored, flags)  # type: ignore[operator]
-    stepped, stepped_states = replay_by_steps(s.module, x, stored, flags)
-    return s.compare(
+
+    def replayed(x: Tensor) -> tuple[Tensor, TensorDict]:
+        return s.module.replay(x, stored, flags)  # type: ignore[operator, no-any-return]
+
+    def stepped(x: Tensor) -> tuple[Tensor, TensorDict]:
+        return replay_by_steps(s.module, x, stored, flags)
+
+    with torch.no_grad():
+        y, states = replayed(x)
+        expected, expected_states = stepped(x)
+    values = s.compare(
         law,
         "replay and a loop that loads stored states by hand differ",
         "replay must start from stored[:, t] at t = 0 and wherever is_init is set, and return the "
         "states after "
         "each step",
-        (y, stepped),
-        *pairs_of(states, stepped_states),
+        (y, expected),
+        *pairs_of(states, expected_states),
     )
+    gradients = compare_gradients(
+        s,
+        law,
+        "the gradients of replay and of a loop that loads stored states by hand differ",
+        "a state that replay detaches from step to step, or its hand-written backward pass",
+        x,
+        [lambda x: replayed(x)[0], lambda x: stepped(x)[0]],
+    )
+    return max(values, gradients)
 
 
 @torch.no_grad()
@@ -342,67 +382,6 @@ def _averages(s: Subject, law: str) -> float:
         "one that is not reset with them)",
         (y, y[:, :1].expand_as(y)),
         tolerance=max(s.tolerance, GUARD),
-    )
-
-
-def _gradients_of(law: str, number: Tensor, inputs: list[Tensor]) -> tuple[Tensor, ...]:
-    """The gradient of a number, zeros where an input has no part in it."""
-    try:
-        return torch.autograd.grad(number, inputs, allow_unused=True, materialize_grads=True)
-    except RuntimeError as error:
-        raise MemoryLawError(
-            law,
-            f"torch cannot compute the gradient ({' '.join(str(error).split())})",
-            "an in-place write (h.mul_(), h[:] = ..., copy_()) into a tensor that the gradient of "
-            "an earlier step reads: make a new one at every step, or write to a clone()",
-        ) from error
-
-
-def _gradients(s: Subject, law: str) -> float:
-    x, state, flags = s.inputs(2, 5)
-    flags[0, 2] = True
-    keys = [k for k, v in leaves(state).items() if v.is_floating_point()]
-    names = [name for name, p in s.module.named_parameters() if p.requires_grad]
-    parameters = [s.module.get_parameter(name).detach().clone() for name in names]
-    arguments = [
-        v.detach().clone().requires_grad_() for v in (x, *(state.get(k) for k in keys), *parameters)
-    ]
-
-    def outputs(x: Tensor, *rest: Tensor) -> Tensor:
-        given = state.clone()
-        for key, leaf in zip(keys, rest[: len(keys)], strict=True):
-            given.set(key, leaf)
-        weights = dict(zip(names, rest[len(keys) :], strict=True))
-        y: Tensor = torch.func.functional_call(s.module, weights, (x, given, flags))[0]
-        return y
-
-    try:
-        torch.autograd.gradcheck(outputs, arguments, fast_mode=True, atol=1e-5, rtol=1e-3)
-    except RuntimeError as error:  # gradcheck's own error class derives from it
-        raise MemoryLawError(
-            law,
-            "autograd and finite differences disagree in float64 "
-            f"({str(error).strip().splitlines()[0]})",
-            "a hand-written backward pass, a detach, a .data or an in-place write",
-        ) from error
-    return 0.0
-
-
-def _gradients_of_steps(s: Subject, law: str) -> float:
-    """The gradient of one call is that of a call a step, as far as rounding lets them agree."""
-    x, state, flags = s.inputs(2, 9)
-    flags[0, 4] = True
-    weight = s.random(2, 1)[..., :1]
-    parameters = [p for p in s.module.parameters() if p.requires_grad]
-    gradients = []
-    for read in (s.module, lambda *inputs: _steps(s, *inputs)):
-        given = x.clone().requires_grad_()
-        y, _ = read(given, state, flags)
-        gradients.append(_gradients_of(law, (weight * y).sum(), [given, *parameters]))
-    pairs = zip(*gradients, strict=True)
-    symptom = "the gradients of one call and of a call a step differ"
-    return s.compare(
-        law, symptom, "a hand-written backward pass, a detach, a .data or an in-place write", *pairs
     )
 
 
@@ -426,7 +405,7 @@ def laws_of(module: nn.Module, dtype: torch.dtype, gradients: bool) -> dict[str,
         # less precise numbers are too coarse for finite differences
         exact = dtype == torch.float64
         if any(getattr(part, "surrogate_gradients", False) for part in module.modules()):
-            laws["gradients of one call are those of its steps"] = _gradients_of_steps
+            laws["gradients of one call are those of its steps"] = gradients_of_steps
         else:
-            laws["gradients are right"] = _gradients if exact else _gradients_of_steps
+            laws["gradients are right"] = gradients_are_right if exact else gradients_of_steps
     return laws

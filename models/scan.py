@@ -222,7 +222,9 @@ def scan_backward_doubling(
     a: Tensor, start: Tensor | None, h0: Tensor, h: Tensor, grad: Tensor
 ) -> tuple[Tensor, Tensor]:
     """The backward pass in the doubling form: a forward scan over flipped time."""
-    shifted = torch.conj_physical(torch.cat([a[:, :1], a[:, 1:].flip(1)], dim=1))
+    # the last step has none behind it; a factor of another step may be NaN, and 0 * NaN is NaN
+    none = torch.zeros_like(a[:, :1])
+    shifted = torch.conj_physical(torch.cat([none, a[:, 1:].flip(1)], dim=1))
     begins = None
     if start is not None:
         begins = torch.cat([torch.zeros_like(start[:, :1]), start[:, 1:].flip(1)], dim=1)

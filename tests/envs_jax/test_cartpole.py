@@ -1,6 +1,7 @@
 """CartPole and NoisyCartPole, checked against the classic equations and the pictures' geometry."""
 
 import math
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -8,6 +9,8 @@ import numpy as np
 import pytest
 
 from arcade_torch.envs_jax import make
+from arcade_torch.envs_jax.cartpole import rules
+from arcade_torch.envs_jax.cartpole.oracle import Belief, _arrow_edges, _update
 from arcade_torch.envs_jax.cartpole.renderer import Geometry, arrow_level, arrow_pictures, pole_span
 from arcade_torch.envs_jax.cartpole.rules import THETA_LIMIT
 from arcade_torch.envs_jax.render.palette import CHARCOAL, COPPER, PINK
@@ -287,3 +290,36 @@ def test_every_visible_variable_changes_the_mdp_picture():
     for name, value in {"x": 1.0, "x_dot": 1.0, "theta": 0.1, "theta_dot": 1.0, "score": 4}.items():
         changed = base._replace(**{name: jnp.asarray(value, getattr(base, name).dtype)})
         assert not np.array_equal(frame, draw(game, changed, False)), name
+
+
+@pytest.mark.parametrize("arrow", ["log", "linear"])
+def test_a_belief_follows_the_pose_from_the_arrows_alone(arrow):
+    """The frames oracle's filter beside the rules: what it believes from the twentieth step on is
+    near the truth, whatever it believed of the episode before.
+    """
+    envs, particles = 8, 400
+    edges = _arrow_edges(make("CartPoleEasy", arrow=arrow))
+    low, high = np.asarray(edges).T
+    update = jax.jit(jax.vmap(partial(_update, edges=edges, sigma=0.0)))
+    move = jax.jit(jax.vmap(rules.move))
+    poses = np.random.default_rng(0).uniform(-0.05, 0.05, (envs, 4)).astype(np.float32)
+    state = jax.jit(rules.at_pose)(poses.T, np.zeros((envs, 4), np.float32))
+    of_before = np.full((envs, particles, 4), 9.0, np.float32)
+    one_alone = np.full((envs, particles), -1e3, np.float32)
+    one_alone[:, 0] = 0.0
+    belief = Belief(of_before, one_alone, jax.random.split(jax.random.PRNGKey(0), envs))
+    action = np.zeros(envs, np.int32)
+    errors = []
+    for t in range(60):
+        truth = np.stack([state.x, state.x_dot, state.theta, state.theta_dot], -1)
+        velocity = truth[:, 1::2, None]
+        codes = ((low <= velocity) & (velocity < high)).argmax(-1)
+        belief, action = update(belief, action, codes, np.full(envs, t == 0))
+        weights = np.exp(np.asarray(belief.log_weight, np.float64))
+        weights /= weights.sum(1, keepdims=True)
+        mean = (weights[..., None] * np.asarray(belief.pose)).sum(1)
+        errors.append(np.abs(mean - truth))
+        state = move(state, action)
+    x, x_dot, theta, theta_dot = np.mean(errors[20:], axis=(0, 1))
+    assert x < 0.06 and x_dot < 0.03 and theta < 0.02 and theta_dot < 0.06
+    assert np.abs(state.theta).max() < THETA_LIMIT

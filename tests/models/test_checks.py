@@ -243,7 +243,14 @@ class StaleReplay(MinGRU):
         return y, states.apply(lambda h: h.roll(1, 1))
 
 
-@pytest.mark.parametrize("model", [ForgetfulReplay, StaleReplay])
+class ReplayOfTheFirst(MinGRU):
+    """Loads the state that was stored for index 0 at every start."""
+
+    def replay(self, x, stored, is_init):
+        return super().replay(x, stored[:, :1].expand(stored.shape), is_init)
+
+
+@pytest.mark.parametrize("model", [ForgetfulReplay, ReplayOfTheFirst, StaleReplay])
 def test_a_wrong_replay_is_caught(model):
     with pytest.raises(MemoryLawError, match="stored") as caught:
         check_memory(model(3, 4))
@@ -335,9 +342,18 @@ class Detaching(LeakyAverage):
         return super().forward(WrongGradient.apply(x), state, is_init)
 
 
-def test_a_wrong_gradient_is_found_in_float32():
+class DetachingWeight(LeakyAverage):
+    """The gradient of a weight alone is that of the last step."""
+
+    def forward(self, x, state, is_init):
+        y, after = super().forward(x, state, is_init)
+        return y + WrongGradient.apply(self.linear.bias.expand(y.shape)), after
+
+
+@pytest.mark.parametrize("model", [Detaching, DetachingWeight])
+def test_a_wrong_gradient_is_found_in_float32(model):
     with pytest.raises(MemoryLawError, match="gradients"):
-        check_memory(Detaching(), dtype=torch.float32)
+        check_memory(model(), dtype=torch.float32)
 
 
 def test_a_type_that_is_no_floating_one_is_refused():

@@ -19,7 +19,7 @@ from arcade_torch.models.scan import (
     scan_backward_doubling,
     scan_doubling,
 )
-from tests.models.scan_cases import linear_scan_loop
+from tests.models.scan_cases import assert_nothing_crosses_a_start, linear_scan_loop
 
 DTYPES = [torch.float64, torch.complex128]
 
@@ -86,11 +86,16 @@ def test_factors_broadcast_over_batch_and_time(shape):
     )
 
 
-def test_real_factors_meet_complex_inputs():
-    a = torch.rand(2, 5, 3, dtype=torch.float64)
-    b = torch.randn(2, 5, 3, dtype=torch.complex128)
-    assert linear_scan(a, b).dtype == torch.complex128
-    torch.testing.assert_close(linear_scan(a, b), linear_scan_loop(a.to(b.dtype), b))
+@pytest.mark.parametrize("steps", [1, 5])
+def test_factors_inputs_and_states_of_several_dtypes_meet_in_the_widest(steps):
+    real = torch.rand(2, steps, 3, dtype=torch.float64)
+    other = torch.randn(2, steps, 3, dtype=torch.complex128)
+    h0 = torch.randn(2, 3)
+    for a, b in ((real, other), (other, real)):
+        h = linear_scan(a, b, None, h0)
+        assert h.dtype == torch.complex128
+        wide = [x.to(other.dtype) for x in (a, b, h0)]
+        torch.testing.assert_close(h, linear_scan_loop(*wide[:2], None, wide[2]))
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -120,6 +125,9 @@ def test_a_state_per_position_is_loaded_at_index_zero_and_at_starts(dtype):
         )
     start[:, 4], start[:, 5:] = True, False
     whole = linear_scan(a, b, start, stored)
+    elsewhere = ~(start | (torch.arange(9) == 0))
+    unread = stored.detach().masked_fill(elsewhere[..., None], torch.nan)
+    assert torch.equal(linear_scan(a, b, start, unread), whole)
     torch.testing.assert_close(whole[:, 4:], linear_scan(a[:, 4:], b[:, 4:], None, stored[:, 4]))
     assert torch.autograd.gradcheck(
         lambda a, b, s: linear_scan(a, b, start, s), (a, b, stored), fast_mode=True
@@ -164,6 +172,26 @@ def test_gradients_stop_at_a_start():
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("where", [1, 9, 19])
+@pytest.mark.parametrize("name", ["serial", "doubling"])
+def test_nothing_that_is_put_before_a_start_crosses_it_in_any_form(name, where, dtype):
+    with back_end(name):
+        assert_nothing_crosses_a_start(where, dtype)
+
+
+def test_not_even_second_derivatives_see_a_nan_before_a_start():
+    a, b, start, h0 = problem(2, 4, (2,), grad=True)
+    start[:, 0] = True
+    seconds = []
+    for state in (h0, torch.full_like(h0, torch.nan)):
+        h = linear_scan(a, b, start, state)
+        (first,) = torch.autograd.grad(h.square().sum(), a, create_graph=True)
+        seconds.append(torch.autograd.grad(first.square().sum(), (a, b)))
+    for clean, poisoned in zip(*seconds, strict=True):
+        assert torch.equal(clean, poisoned)
+
+
+@pytest.mark.parametrize("dtype", DTYPES)
 def test_vmap_equals_a_python_loop_values_and_gradients(dtype):
     a, b, start, h0 = problem(4, 5, (3,), dtype)
     batched = [x.unflatten(0, (2, 2)) for x in (a, b, start, h0)]
@@ -173,6 +201,8 @@ def test_vmap_equals_a_python_loop_values_and_gradients(dtype):
         a[:2], b.unflatten(0, (2, 2)), start[:2], h0[:2]
     )
     torch.testing.assert_close(some[1], linear_scan(a[:2], b[2:], start[:2], h0[:2]))
+    last = [x.movedim(0, -1) for x in batched]
+    torch.testing.assert_close(torch.vmap(linear_scan, in_dims=-1)(*last), mapped)
 
     leaves = [x.clone().requires_grad_() for x in (a, b, h0)]
     plain = torch.autograd.grad(
@@ -204,9 +234,12 @@ def test_opcheck_finds_nothing(dtype):
     a, b, start, h0 = problem(2, 4, (3,), dtype, grad=True)
     torch.library.opcheck(scan, (a, b, start, h0))
     torch.library.opcheck(scan, (a, b, None, h0))
+    time_first = torch.randn(4, 2, 3, dtype=dtype).transpose(0, 1)
+    torch.library.opcheck(scan, (a, time_first, start, h0))
     with torch.no_grad():
         h = scan(a, b, start, h0)
-    torch.library.opcheck(scan_backward, (a, start, h0, h, torch.randn_like(h)))
+    for grad in (torch.randn_like(h), time_first):
+        torch.library.opcheck(scan_backward, (a, start, h0, h, grad))
 
 
 @pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
@@ -233,7 +266,9 @@ def test_it_compiles_into_one_graph(backend):
         ({"start": torch.zeros(2, 5)}, "bool"),
         ({"h0": torch.zeros(3, 3)}, "h0"),
         ({"a": torch.zeros(4)}, "broadcast"),
+        ({"a": torch.zeros(1, 2, 5, 3)}, "broadcast"),
         ({"b": torch.zeros(2)}, "T >= 1"),
+        ({"a": torch.zeros(2, 0, 3), "b": torch.zeros(2, 0, 3)}, "T >= 1"),
     ],
 )
 def test_wrong_shapes_get_one_clear_line(change, message):

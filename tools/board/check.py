@@ -2,6 +2,7 @@
 
 import datetime
 import hashlib
+import math
 import random
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -264,6 +265,11 @@ def _check_played(entry: Entry, run: BoardRun, played: Played, is_same: bool) ->
                 f"{name} of {run.name}: {actual:,}, the entry says {getattr(entry, name):,}"
             )
     if (played.score, played.returns_sha256) == (run.score, run.returns_sha256):
+        if not math.isclose(played.std, run.std, rel_tol=1e-6, abs_tol=1e-9):
+            raise EntryRefusedError(
+                f"std of {run.name}: evaluated again it is {played.std!r}, the entry says "
+                f"{run.std!r}"
+            )
         return True
     difference = abs(played.score - run.score)
     tolerance = max(played.half_width, LEAST_TOLERANCE)

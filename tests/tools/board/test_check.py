@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -14,8 +15,8 @@ import pytest
 from arcade_torch.tools.board import check as checks
 from arcade_torch.tools.board import submit as submits
 from arcade_torch.tools.board.check import CheckRecord, check, read_record, write_record
-from arcade_torch.tools.board.entry import EntryRefusedError
-from arcade_torch.tools.board.evaluation import Evaluator
+from arcade_torch.tools.board.entry import BoardRun, EntryRefusedError
+from arcade_torch.tools.board.evaluation import Evaluator, Played
 from arcade_torch.tools.board.submit import submit
 from tests.tools.board.boards import GAME, SHORT, WORDS, plain_entry, write_pair, write_run
 
@@ -24,9 +25,6 @@ Plain = dict[str, Any]
 
 def no_episodes(*arguments: Any) -> Any:
     raise AssertionError("an agent was evaluated")
-
-
-"""What an agent that is not played scored."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -94,6 +92,10 @@ def set_score(plain: Plain) -> None:
 
 def set_score_and_its_hash(plain: Plain) -> None:
     plain["runs"][1] |= {"score": 0.9, "std": 0.1, "returns_sha256": "0" * 64}
+
+
+def set_std(plain: Plain) -> None:
+    plain["runs"][1]["std"] += 0.01
 
 
 def set_evaluation_seed(plain: Plain) -> None:
@@ -175,6 +177,7 @@ def set_state(plain: Plain) -> None:
 FALSIFIED: dict[Callable[[Plain], None], str] = {
     set_score: f"score of {GAME} partial, seed 1: evaluated again it is",
     set_score_and_its_hash: f"score of {GAME} partial, seed 1: evaluated again it is",
+    set_std: f"std of {GAME} partial, seed 1: evaluated again it is",
     set_evaluation_seed: "evaluation.seed is 7; the protocol of this version demands 1000000",
     set_episodes: "evaluation.episodes is 2",
     set_training_seed: f"no run of mingru on {GAME} full, seed 6 lies below",
@@ -254,6 +257,49 @@ def test_on_the_same_machine_and_versions_a_score_has_to_be_equal_to_the_bit(
         assert check(write(tmp_path, plain), runs, protocol=SHORT).equal == 3
 
 
+def check_one(difference: float, half_width: float, is_same: bool, **changes: Any) -> bool:
+    """Whether a run is equal to the bit that played otherwise by so much."""
+    score = 0.25
+    sha256 = "1" * 64 if difference else "0" * 64
+    played = Played(score + difference, 0.1, half_width, sha256, 10, 8, ("pixels",))
+    hashes = {"returns_sha256": "0" * 64, "weights_sha256": "0" * 64}
+    run = BoardRun(GAME, "full", 1, score=score, std=0.1, seconds=1.0, **hashes)
+    sizes: Any = SimpleNamespace(parameters=10, state_bytes=8)
+    return checks._check_played(sizes, run, replace(played, **changes), is_same)
+
+
+def test_elsewhere_a_score_may_differ_by_half_its_interval_or_the_least_tolerance() -> None:
+    assert check_one(0, 0.0, is_same=True) and check_one(0, 0.0, is_same=False)
+    for sign in (-1, 1):
+        for half_width, tolerance in ((0.1, 0.1), (0.001, 0.002), (0.0, 0.002)):
+            assert not check_one(0.99 * sign * tolerance, half_width, is_same=False)
+            with pytest.raises(EntryRefusedError, match=f"to be within {tolerance:.4f}"):
+                check_one(1.01 * sign * tolerance, half_width, is_same=False)
+            with pytest.raises(EntryRefusedError, match="to be equal to the bit"):
+                check_one(1e-12 * sign, half_width, is_same=True)
+
+
+def test_equal_scores_of_other_episodes_are_not_equal_to_the_bit() -> None:
+    assert not check_one(0, 0.1, is_same=False, returns_sha256="2" * 64)
+    with pytest.raises(EntryRefusedError, match="to be equal to the bit"):
+        check_one(0, 0.1, is_same=True, returns_sha256="2" * 64)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"observations": ("pixels", "state")}, "privileged observation in .*, acting: 'state'"),
+        ({"parameters": 11}, "parameters of .*: 11, the entry says 10"),
+        ({"state_bytes": 9}, "state_bytes of .*: 9, the entry says 8"),
+        ({"std": 0.2}, "std of .*: evaluated again it is 0.2, the entry says 0.1"),
+    ],
+)
+def test_what_was_played_is_held_to_the_entry(changes: Plain, message: str) -> None:
+    assert check_one(0, 0.1, is_same=False, parameters=9, state_bytes=7)
+    with pytest.raises(EntryRefusedError, match=message):
+        check_one(0, 0.1, is_same=False, **changes)
+
+
 def test_a_part_is_drawn_and_only_that_is_looked_for(
     runs: Path, honest: Plain, tmp_path: Path
 ) -> None:
@@ -262,7 +308,9 @@ def test_a_part_is_drawn_and_only_that_is_looked_for(
     places = [checks._drawn(range(40), 3, random.Random(seed)) for seed in range(5)]
     assert all(len(set(drawn)) == 3 for drawn in places)
     assert len({tuple(drawn) for drawn in places}) == 5
-    assert checks._drawn(range(4), 0, random.Random(0)) == [0, 1, 2, 3]
+    assert len(checks._drawn(range(4), 3, random.Random(0))) == 3
+    for count in (0, 4, 5):
+        assert checks._drawn(range(4), count, random.Random(0)) == [0, 1, 2, 3]
     folder = runs / f"{GAME}-partial-mingru-2"
     generators = [random.Random(seed) for seed in range(40)]
     drawing_last = [

@@ -1,6 +1,7 @@
 """The tests of memory separate what theory separates; results are kept, drawn and written down."""
 
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -9,11 +10,11 @@ import torch
 
 from arcade_torch.models import MemoryBlock, make_memory
 from arcade_torch.tools import cli
-from arcade_torch.tools.bench.memory_tests import TESTS, table
-from arcade_torch.tools.bench.memory_tests.batch import MemoryTest
+from arcade_torch.tools.bench.memory_tests import TESTS, table, training
+from arcade_torch.tools.bench.memory_tests.batch import Batch, MemoryTest
 from arcade_torch.tools.bench.memory_tests.delay import DELAY, SYMBOLS
 from arcade_torch.tools.bench.memory_tests.table import Row, cells, markdown
-from arcade_torch.tools.bench.memory_tests.training import Setting, train
+from arcade_torch.tools.bench.memory_tests.training import Setting, Trained, train
 from arcade_torch.tools.bench.recall import TestName
 from arcade_torch.tools.files import read_rows
 
@@ -74,6 +75,51 @@ def test_equal_seeds_give_equal_results_and_training_ends_when_it_is_solved() ->
     assert first.accuracy == again.accuracy and first.steps == again.steps
     assert first.accuracy[16][0] > 0.95 and first.steps < 400
     assert first.accuracy != train("gdn", DELAY, 4, setting).accuracy
+
+
+def test_what_is_learned_what_ends_a_training_and_what_is_asked_are_different_data(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Of all runs: no episode of a test was seen in a training, its own or another seed's."""
+    draw = MemoryTest.batch
+    drawn: list[tuple[int, int]] = []
+
+    def recorded(self: MemoryTest, seed: int, rows: int, level: int) -> Batch:
+        drawn.append((seed, rows))
+        return draw(self, seed, rows, level)
+
+    monkeypatch.setattr(MemoryTest, "batch", recorded)
+    monkeypatch.setattr(training, "_learn", lambda *arguments: None)
+    setting = replace(QUICK, steps=600, rows=2, check_every=100, answers=600)
+    for seed in (0, 1):
+        train("mlp", TESTS["rewriting"], seed, setting)
+    learned = [seed for seed, rows in drawn if rows == setting.rows]
+    others = [seed for seed, rows in drawn if rows != setting.rows]
+    assert len(learned) == 2 * 600
+    assert len(others) == 2 * (6 + 3 * 2)
+    assert len({seed for seed, _ in drawn}) == len(drawn)
+
+
+def test_rows_of_another_setting_or_without_a_size_are_measured_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trainings = []
+
+    def trained(memory: str, test: MemoryTest, seed: int, setting: Setting) -> Trained:
+        trainings.append((memory, test.name, seed, setting.hidden_size, setting.steps))
+        return Trained(dict.fromkeys(test.tested, (0.5, 1000)), setting.steps, 1.0, 10, 4)
+
+    monkeypatch.setattr(table, "train", trained)
+    file = tmp_path / "t.csv"
+    for setting in (QUICK, QUICK, replace(QUICK, steps=30), replace(QUICK, hidden_size=8)):
+        rows = list(table.measured(file, ["gru"], [DELAY], [0], setting, lambda line: None))
+        assert {(row.hidden_size, row.most_steps) for row in rows} == {
+            (setting.hidden_size, setting.steps)
+        }
+        assert [row.level for row in rows] == list(DELAY.tested)
+    assert [key[3:] for key in trainings] == [(16, 20), (16, 30), (8, 20)]
+    assert len(list(table.measured(file, ["gru"], [DELAY], [1], QUICK, lambda line: None))) == 3
+    assert len(trainings) == 4
 
 
 WORDS = ["bench", "recall", "--tests", "parity", "delay", "--steps", "3", "--hidden-size", "8"]
