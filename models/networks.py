@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_sizes, is_whole
 from arcade_torch.models.encoders import Encoder
 from arcade_torch.models.memory import batch_shape, first_state, replay
 from arcade_torch.models.recurrence import Key, Recurrence, Store
@@ -22,6 +23,15 @@ if TYPE_CHECKING:
 __all__ = ["MemoryBlock", "MemoryNetwork"]
 
 SKIPS = ("residual", "none")
+
+
+def check_memory_name(memory: Any) -> None:
+    """Refuse what is neither the name of a memory nor a factory (ValueError)."""
+    if not isinstance(memory, str) and (isinstance(memory, nn.Module) or not callable(memory)):
+        raise ValueError(
+            "memory must be a name or a factory (input_size, hidden_size, **options), got "
+            f"{memory!r}"
+        )
 
 
 class MemoryBlock(nn.Module):
@@ -42,7 +52,8 @@ class MemoryBlock(nn.Module):
         memory_options: passed on to the cells.
 
     Raises:
-        ValueError: unknown memory or skip, or fewer than one layer.
+        ValueError: unknown memory or skip, fewer than one layer, or a size that is no whole number
+            from 1.
     """
 
     def __init__(
@@ -58,6 +69,11 @@ class MemoryBlock(nn.Module):
         super().__init__()
         if skip not in SKIPS:
             raise ValueError(f"skip must be one of {', '.join(SKIPS)}, got {skip!r}")
+        for name, size in (("input_size", input_size), ("hidden_size", hidden_size)):
+            if not is_whole(size) or size < 1:
+                raise ValueError(f"{name} must be a whole number from 1, got {size!r}")
+        check_sizes(layers=layers)
+        check_memory_name(memory)
         if layers < 1:
             raise ValueError(f"layers must be at least 1, got {layers}")
         options = memory_options or {}
