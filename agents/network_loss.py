@@ -2,12 +2,15 @@
 
 import copy
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from tensordict import TensorDictParams
 from torchrl.objectives import LossModule
 
-__all__ = ["NetworkLoss"]
+__all__ = ["NetworkLoss", "Reduction"]
+
+Reduction = Literal["mean", "sum", "none"]
+"""How a loss makes one number of those of all steps."""
 
 
 class NetworkLoss(LossModule):

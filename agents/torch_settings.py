@@ -1,11 +1,35 @@
-"""The settings of torch that a run computes under, whatever the process or the caller has set."""
+"""The settings of torch that a run computes under, whatever the process or the caller has set, and
+the device that somebody names.
+"""
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from typing import Any
 
 import torch
 
-__all__ = ["plain_torch"]
+__all__ = ["device_of", "plain_torch"]
+
+
+def device_of(device: Any) -> torch.device:
+    """The device of a name.
+
+    Raises:
+        ValueError: there is none of this name, or not here.
+
+    Example:
+        >>> device_of("cpu")
+        device(type='cpu')
+    """
+    try:
+        found = torch.device(device)
+        torch.empty(0, device=found)
+    except (RuntimeError, AssertionError, TypeError, ValueError, OverflowError) as error:
+        reason = str(error).partition("\n")[0][:120]
+        raise ValueError(
+            f"device is {device!r}, expected one that is here, such as 'cpu' ({reason})"
+        ) from error
+    return found
 
 
 @contextmanager
