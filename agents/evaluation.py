@@ -143,13 +143,7 @@ def evaluate(
             environment of ours.
     """
     _check_players(agent, env)
-    episodes = coerce("episodes", plain(episodes), int)
-    require(
-        1 <= episodes <= MOST_EPISODES,
-        "episodes",
-        episodes,
-        f"a whole number from 1 to {MOST_EPISODES}",
-    )
+    episodes = _count(episodes)
     held_out_seed(seed)  # before anything is compiled
     require(
         observability in (None, "full", "partial"),
@@ -172,6 +166,14 @@ def evaluate(
         return _play(agent, env)
     finally:
         env.set_observability(before)
+
+
+def _count(episodes: Any) -> int:
+    """The number of episodes; refused (ValueError) where no batch is of so many."""
+    count: int = coerce("episodes", plain(episodes), int)
+    allowed = f"a whole number from 1 to {MOST_EPISODES}"
+    require(1 <= count <= MOST_EPISODES, "episodes", episodes, allowed)
+    return count
 
 
 def _check_players(agent: Any, env: Any) -> None:

@@ -7,10 +7,20 @@ from typing import Any, Literal, Self
 from tensordict import TensorDictParams
 from torchrl.objectives import LossModule
 
-__all__ = ["NetworkLoss", "Reduction"]
+__all__ = ["NetworkLoss", "Reduction", "check_actor"]
 
 Reduction = Literal["mean", "sum", "none"]
 """How a loss makes one number of those of all steps."""
+
+
+def check_actor(network: Any) -> None:
+    """Refuse (TypeError) what draws no actions."""
+    if not hasattr(network, "get_dist"):
+        raise TypeError(
+            "actor_network must be a probabilistic TensorDict module, such as a "
+            f"ProbabilisticActor; got a {type(network).__name__} (of an ActorValueOperator: "
+            "get_policy_operator(), get_value_operator())"
+        )
 
 
 class NetworkLoss(LossModule):

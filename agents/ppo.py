@@ -1,6 +1,5 @@
 """PPO with a memory in actor and critic, or in neither."""
 
-import math
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any
@@ -27,11 +26,11 @@ from arcade_torch.agents.batch_checks import (
     stored_numbers,
     with_mask,
 )
-from arcade_torch.agents.checked import Positive, coerce, require
+from arcade_torch.agents.checked import Finite, Positive, coerce, require
 from arcade_torch.agents.config import PPOConfig, TimeLimit
 from arcade_torch.agents.layout import NetworkInputs, as_steps, written
 from arcade_torch.agents.learner import Learner, Training
-from arcade_torch.agents.network_loss import NetworkLoss, Reduction
+from arcade_torch.agents.network_loss import NetworkLoss, Reduction, check_actor
 from arcade_torch.agents.policy import make_actor
 from arcade_torch.agents.returns import SequenceGAE
 from arcade_torch.envs_jax.validation import plain
@@ -188,14 +187,7 @@ class PPOLoss(NetworkLoss):
         super().__init__()
         self.functional = coerce("functional", functional, bool)
         self.critic_network = None
-        if not hasattr(actor_network, "get_dist"):
-            raise TypeError(
-                "actor_network must be a probabilistic TensorDict module, such as a "
-                f"ProbabilisticActor; got a {type(actor_network).__name__} (of an "
-                "ActorValueOperator: get_policy_operator(), get_value_operator())"
-            )
-        if critic_network is not None:
-            NetworkInputs(critic_network)
+        check_actor(actor_network)
         if critic_network is None:
             require(
                 _may_write_value(actor_network, self.tensor_keys.value),
@@ -205,6 +197,7 @@ class PPOLoss(NetworkLoss):
             )
             self.inputs = NetworkInputs(actor_network)
         else:
+            NetworkInputs(critic_network)
             self.inputs = NetworkInputs(TensorDictSequential(actor_network, critic_network))
         if not functional:
             self.actor_network = actor_network
@@ -215,15 +208,15 @@ class PPOLoss(NetworkLoss):
                 self.convert_to_functional(critic_network, "critic_network")
         self.time_limit = coerce("time_limit", time_limit, TimeLimit)
         self.clip_value = coerce("clip_value", clip_value, bool)
-        self.critic_coeff = _finite("critic_coeff", critic_coeff)
-        self.prediction_coeff = _finite("prediction_coeff", prediction_coeff)
+        self.critic_coeff = coerce("critic_coeff", plain(critic_coeff), Finite)
+        self.prediction_coeff = coerce("prediction_coeff", plain(prediction_coeff), Finite)
         self.normalize_advantage = coerce("normalize_advantage", normalize_advantage, bool)
         has_scale = advantage_norm is None or hasattr(advantage_norm, "scale")
         require(has_scale, "advantage_norm", advantage_norm, "None or such as PopArtValueNorm")
         self.advantage_norm = advantage_norm
         self.reduction = coerce("reduction", reduction, Reduction)
         clip_epsilon = coerce("clip_epsilon", plain(clip_epsilon), Positive)
-        entropy_coeff = _finite("entropy_coeff", entropy_coeff)
+        entropy_coeff = coerce("entropy_coeff", plain(entropy_coeff), Finite)
         device = next((p.device for p in self.parameters()), torch.device("cpu"))
         for name, number in (("clip_epsilon", clip_epsilon), ("entropy_coeff", entropy_coeff)):
             value = torch.full((), number, dtype=torch.float32, device=device)
@@ -375,13 +368,6 @@ class PPOLoss(NetworkLoss):
         if not self.normalize_advantage:
             return advantage
         return normalize(advantage, None if mask is None else mask.unsqueeze(-1))
-
-
-def _finite(name: str, value: Any) -> float:
-    """A weight of the loss."""
-    number: float = coerce(name, plain(value), float)
-    require(math.isfinite(number), name, value, "a finite number")
-    return number
 
 
 def _fitting(action: Tensor, policy: Distribution) -> Tensor:

@@ -3,7 +3,6 @@ TorchRL.
 """
 
 from contextlib import nullcontext
-from numbers import Real
 from typing import Any
 
 import torch
@@ -17,6 +16,7 @@ from arcade_torch.agents.checked import Count, Fraction, coerce, require
 from arcade_torch.agents.config import TimeLimit
 from arcade_torch.agents.layout import NetworkInputs, insert_final_observations, unroll
 from arcade_torch.envs_jax.validation import format_value, plain
+from arcade_torch.models.arguments import is_number
 
 
 def q_lambda_return(
@@ -138,10 +138,7 @@ def values_and_traces(
     lambda, 0 at every end and at the last step. Arguments that do not fit are refused, ``others``
     for their shape alone.
     """
-    for x in (reward, next_value, terminated, truncated, *others):
-        if not isinstance(x, Tensor):
-            kind = type(x).__name__
-            raise ValueError(f"rewards, values and ends must be tensors [B, T]; got a {kind}")
+    _check_tensors(reward, next_value, terminated, truncated, *others)
     shapes = {tuple(x.shape) for x in (reward, next_value, terminated, truncated, *others)}
     if len(shapes) != 1 or reward.ndim != 2 or reward.shape[1] == 0:
         raise ValueError(
@@ -168,11 +165,19 @@ def values_and_traces(
     return next_value.to(reward.dtype).masked_fill(no_value, 0.0), trace
 
 
+def _check_tensors(*values: Any) -> None:
+    """Refuse what is no tensor (ValueError)."""
+    for x in values:
+        if not isinstance(x, Tensor):
+            kind = type(x).__name__
+            raise ValueError(f"rewards, values and ends must be tensors [B, T]; got a {kind}")
+
+
 def _is_fraction(value: Any) -> bool:
     """Whether a value is one number in [0, 1]."""
     if isinstance(value, Tensor):
         return value.numel() == 1 and bool((value >= 0.0) & (value <= 1.0))
-    return isinstance(value, Real) and not isinstance(value, bool) and 0.0 <= value <= 1.0
+    return is_number(value) and 0.0 <= value <= 1.0
 
 
 def solve_backward(base: Tensor, trace: Tensor) -> Tensor:

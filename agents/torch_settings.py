@@ -22,14 +22,14 @@ def device_of(device: Any) -> torch.device:
         device(type='cpu')
     """
     try:
-        found = torch.device(device)
-        torch.empty(0, device=found)
+        named = torch.device(device)
+        torch.empty(0, device=named)
     except (RuntimeError, AssertionError, TypeError, ValueError, OverflowError) as error:
         reason = str(error).partition("\n")[0][:120]
         raise ValueError(
             f"device is {device!r}, expected one that is here, such as 'cpu' ({reason})"
         ) from error
-    return found
+    return named
 
 
 @contextmanager
