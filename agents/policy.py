@@ -209,10 +209,10 @@ class Agent(TensorDictModuleBase):
             ``(action int64 [N], extras, new state)``, with the extras ``q_value`` float32 [N, A],
             or ``logits`` [N, A] and ``state_value`` [N].
         """
-        pixels = obs.get("pixels").unsqueeze(1)
+        pixels = obs["pixels"].unsqueeze(1)
         steps = pixels.shape[0], 1
-        last_action = obs.get("last_action").reshape(steps)
-        is_init = obs.get("is_init").reshape(steps)
+        last_action = obs["last_action"].reshape(steps)
+        is_init = obs["is_init"].reshape(steps)
         out, state = self.network.remember(self.network.encode(pixels), last_action, is_init, state)
         heads = self.network.by_head(out.squeeze(1))
         if "logits" in heads:

@@ -8,7 +8,15 @@ from typing import Any
 import numpy as np
 import torch
 
-__all__ = ["check_flags", "check_numbers", "check_seed", "check_sizes", "is_number", "is_whole"]
+__all__ = [
+    "check_flags",
+    "check_keys",
+    "check_numbers",
+    "check_seed",
+    "check_sizes",
+    "is_number",
+    "is_whole",
+]
 
 
 def is_whole(value: Any) -> bool:
@@ -46,6 +54,14 @@ def is_number(value: Any) -> bool:
     """Whether a value is a finite number, of numpy too; True and False are none."""
     is_real = isinstance(value, numbers.Real) and not isinstance(value, bool)
     return is_real and math.isfinite(value)
+
+
+def check_keys(**keys: Any) -> None:
+    """Refuse, by name, what is no key of a TensorDict (ValueError)."""
+    for name, key in keys.items():
+        parts = key if isinstance(key, tuple) and key else (key,)
+        if not all(isinstance(part, str) for part in parts):
+            raise ValueError(f"{name} must be a string or a tuple of strings, got {key!r}")
 
 
 def check_numbers(**values: Any) -> None:

@@ -34,6 +34,25 @@ def check_memory_name(memory: Any) -> None:
         )
 
 
+def _check_steps(features: Tensor, last_action: Any, is_init: Any) -> None:
+    """Refuse last actions and start flags that are not one a step (ValueError): other shapes would
+    be stretched over the batch.
+    """
+    lead = features.shape[:-1]
+    _check_one_a_step("last_action", "whole numbers", last_action, lead)
+    _check_one_a_step("is_init", "bool", is_init, lead)
+
+
+def _check_one_a_step(name: str, kind: str, value: Any, lead: Sequence[int]) -> None:
+    given = type(value).__name__
+    if isinstance(value, Tensor):
+        fits = value.dtype == torch.bool if kind == "bool" else not value.is_floating_point()
+        if fits and list(value.shape) == list(lead):
+            return
+        given = f"{value.dtype} {list(value.shape)}"
+    raise ValueError(f"{name} must be {kind} {list(lead)}, one a step, got {given}")
+
+
 class MemoryBlock(nn.Module):
     """x = W u; then per layer y = cell(x), z = LeakyReLU(LayerNorm(V y)), and x + z (skip
     "residual") or z ("none").
@@ -315,6 +334,10 @@ class MemoryNetwork(TensorDictModuleBase):
         Returns:
             (float [B, T, A], with a value head [B, T, A + 1], state TensorDict [B] after the last
             step).
+
+        Raises:
+            ValueError: last actions or start flags are not one a step, or another shape or type
+                does not fit.
         """
         if self.num_actions:
             features = self._append(features, last_action, is_init)
@@ -392,6 +415,7 @@ class MemoryNetwork(TensorDictModuleBase):
         """Features [..., E] with the one-hot last action [..., E + num_actions]; flags are bool
         [...].
         """
+        _check_steps(features, last_action, is_init)
         one_hot = last_action.unsqueeze(-1) == self.actions
         if self.zero_action_on_reset:
             one_hot = one_hot & ~is_init.unsqueeze(-1)

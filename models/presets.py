@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from arcade_torch.models.arguments import is_whole
+from arcade_torch.models.arguments import check_keys, is_whole
 from arcade_torch.models.encoders import Encoder, PaperEncoder, SmallEncoder
 from arcade_torch.models.networks import SKIPS, MemoryBlock, MemoryNetwork, check_memory_name
 from arcade_torch.models.recurrence import Key, Store
@@ -176,10 +176,7 @@ def _check_keys(out_key: Any, value_key: Any, state_key: Any) -> None:
     keys = {"out_key": out_key, "state_key": state_key}
     if value_key is not None:
         keys["value_key"] = value_key
-    for name, key in keys.items():
-        parts = key if isinstance(key, tuple) and key else (key,)
-        if not all(isinstance(part, str) for part in parts):
-            raise ValueError(f"{name} must be a string or a tuple of strings, got {key!r}")
+    check_keys(**keys)
     if out_key == value_key:
         raise ValueError(f"out_key and value_key are both {out_key!r}: give each head its own")
 

@@ -12,6 +12,7 @@ from arcade_torch.models import (
     ActorCriticNetwork,
     MatrixSteps,
     MemoryBlock,
+    MemoryModule,
     PaperEncoder,
     SmallEncoder,
     check_memory,
@@ -297,3 +298,39 @@ def test_the_arguments_of_a_memory_block_are_checked():
     for wrong in (1.5, True, "2"):
         one_line("^layers must be a whole number", MemoryBlock, 4, 4, layers=wrong)
     one_line("^memory must be a name or a factory", MemoryBlock, 4, 4, None)
+
+
+@pytest.mark.parametrize("steps", [2, 3])
+def test_last_actions_and_start_flags_have_a_number_a_step(steps):
+    network = make_network("small", "gru")
+    features = torch.zeros(2, steps, network.encoder.feature_size)
+    last_action = torch.zeros(2, steps, dtype=torch.int64)
+    flags = torch.zeros(2, steps, dtype=torch.bool)
+    state = network.initial_state(2)
+    one_hot = torch.zeros(2, steps, 5)
+    for wrong in (last_action[..., None], one_hot, last_action[0], last_action[:, :1], None):
+        one_line(
+            rf"^last_action must be whole numbers \[2, {steps}\]",
+            network.remember, features, wrong, flags, state,
+        )  # fmt: skip
+    one_line(
+        "^last_action must be whole", network.remember, features, last_action + 0.5, flags, state
+    )
+    for wrong in (flags[..., None], flags[0], flags[:, :1]):
+        one_line(
+            rf"^is_init must be bool \[2, {steps}\]",
+            network.remember,
+            features,
+            last_action,
+            wrong,
+            state,
+        )
+
+
+def test_the_keys_and_switches_of_a_memory_module_are_checked():
+    memory = make_memory("gru", 3, 4)
+    for name in ("in_key", "out_key", "state_key", "is_init_key"):
+        for wrong in (3, None, (), ("a", 3)):
+            one_line(f"^{name} must be a string or a tuple", MemoryModule, memory, **{name: wrong})
+    for name in ("default_recurrent_mode", "check_sequences"):
+        one_line(f"^{name} must be True or False", MemoryModule, memory, **{name: "no"})
