@@ -8,7 +8,14 @@ from typing import Any
 
 from arcade_torch.agents.checked import coerce, require, whole_number
 
-__all__ = ["check_flags", "check_played", "check_strengths", "check_twin", "check_whole"]
+__all__ = [
+    "check_flags",
+    "check_played",
+    "check_strengths",
+    "check_twin",
+    "check_white",
+    "check_whole",
+]
 
 
 def check_played(seed: Any, observability: Any = None, **counts: tuple[Any, int]) -> None:
@@ -25,6 +32,13 @@ def check_twin(observability: Any) -> None:
     """Refuse what names no twin; None leaves that to the agent."""
     is_twin = isinstance(observability, str | None) and observability in (None, "full", "partial")
     require(is_twin, "observability", observability, "'full' or 'partial'")
+
+
+def check_white(white: Any) -> None:
+    """Refuse what is not the value of a white pixel; None is that of the frames' type."""
+    is_number = hasattr(white, "__float__") and not isinstance(white, bool)
+    fits = white is None or (is_number and 0 < float(white) < math.inf)
+    require(fits, "white", white, "a number above 0")
 
 
 def check_flags(**flags: Any) -> None:

@@ -9,6 +9,7 @@ import torch
 
 from arcade_torch.agents import from_pretrained
 from arcade_torch.tools import (
+    as_policy,
     beliefs,
     contamination,
     contamination_example,
@@ -113,6 +114,17 @@ def test_the_numbers_of_saliency_are_whole(agent):
         one_line("^chunk must be", saliency, agent, frames, chunk=wrong)
     for wrong in (torch.int64, torch.complex64, "float32"):
         one_line("^dtype must be", saliency, agent, frames, dtype=wrong)
+
+
+def test_a_window_without_frames_is_refused(agent):
+    frames = torch.zeros(0, 128, 128, 3, dtype=torch.uint8)
+    one_line("^n must be inside a window of 0 frames", saliency, agent, frames)
+
+
+def test_white_is_a_number_above_0(agent):
+    for wrong in (0, -1.0, math.nan, math.inf, "white", True):
+        one_line("^white must be a number above 0", as_policy, agent, white=wrong)
+    assert as_policy(agent, white=1).white == 1
 
 
 def test_the_numbers_of_the_bootstrap_are_checked():

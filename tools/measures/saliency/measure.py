@@ -22,6 +22,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from arcade_torch.agents.checked import require, whole_number
+from arcade_torch.models.arguments import is_whole
 from arcade_torch.tools.measures.frames import as_array, channel_axis, float_type
 from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.masked import refuse_nan
@@ -148,7 +149,7 @@ def _index(n: int, frames: Tensor) -> int:
     """The index of a frame, counted from the first; negative ``n`` count from the end."""
     require(frames.ndim > 1, "the shape of frames", list(frames.shape), "[T, H, W, C] or the like")
     total = frames.shape[0]
-    n = whole_number("n", n, -total)
+    require(is_whole(n), "n", n, "a whole number")
     require(-total <= n < total, "n", n, f"inside a window of {total} frames")
     return n % total
 
