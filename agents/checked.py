@@ -4,6 +4,8 @@ allowed. Nothing here imports torch.
 
 import dataclasses
 import json
+import math
+import operator
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import (
@@ -31,6 +33,7 @@ Count = Annotated[int, Range("a whole number >= 1 (and at most 10**6)", lambda x
 CountOrZero = Annotated[int, Range("a whole number >= 0", lambda x: 0 <= x <= 10**15)]
 Positive = Annotated[float, Range("a number > 0", lambda x: x > 0.0)]
 PositiveOrZero = Annotated[float, Range("a number >= 0", lambda x: x >= 0.0)]
+Finite = Annotated[float, Range("a finite number", math.isfinite)]
 Fraction = Annotated[float, Range("a number in [0, 1]", lambda x: 0.0 <= x <= 1.0)]
 Options = Mapping[str, Any]
 
@@ -42,6 +45,20 @@ def require(condition: bool, name: str, value: Any, allowed: str) -> None:
     if not condition:
         one_line = " ".join(line.strip() for line in repr(value).splitlines())
         raise ValueError(f"{name} must be {allowed}; got {one_line}")
+
+
+def whole_number(name: str, value: Any, least: int) -> int:
+    """A whole number as an int, of numpy too; refuse anything else, and one below the least
+    (ValueError).
+    """
+    try:
+        number = operator.index(value)
+    except TypeError:
+        number = None
+    if number is None or isinstance(value, bool):
+        require(False, name, value, f"a whole number, and at least {least}")
+    require(number >= least, name, value, f"at least {least}")  # type: ignore[operator]
+    return number  # type: ignore[return-value]
 
 
 def coerce(name: str, value: Any, kind: Any) -> Any:

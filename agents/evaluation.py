@@ -8,12 +8,13 @@ import torch
 from numpy.typing import NDArray
 
 import arcade_torch
-from arcade_torch.agents.checked import require
+from arcade_torch.agents.checked import coerce, require
 from arcade_torch.agents.config import MOST_EPISODES, SEED_LIMIT, TrainConfig
 from arcade_torch.agents.metrics import student_half_width
 from arcade_torch.agents.torch_settings import plain_torch
 from arcade_torch.envs_jax.game import check_ends
 from arcade_torch.envs_jax.registry import is_mixture, resolve_id
+from arcade_torch.envs_jax.validation import plain
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,7 @@ def held_out_seed(seed: int) -> int:
     uses environment seeds below 2**30, evaluation those from 2**30 on, so no environment is ever in
     both.
     """
+    seed = coerce("seed", plain(seed), int)
     require(0 <= seed < SEED_LIMIT, "seed", seed, f"in [0, {SEED_LIMIT})")
     return SEED_LIMIT + seed
 
@@ -141,12 +143,8 @@ def evaluate(
             environment of ours.
     """
     _check_players(agent, env)
-    require(
-        1 <= episodes <= MOST_EPISODES,
-        "episodes",
-        episodes,
-        f"a whole number from 1 to {MOST_EPISODES}",
-    )
+    episodes = _count(episodes)
+    held_out_seed(seed)  # before anything is compiled
     require(
         observability in (None, "full", "partial"),
         "observability",
@@ -168,6 +166,14 @@ def evaluate(
         return _play(agent, env)
     finally:
         env.set_observability(before)
+
+
+def _count(episodes: Any) -> int:
+    """The number of episodes; refused (ValueError) where no batch is of so many."""
+    count: int = coerce("episodes", plain(episodes), int)
+    allowed = f"a whole number from 1 to {MOST_EPISODES}"
+    require(1 <= count <= MOST_EPISODES, "episodes", episodes, allowed)
+    return count
 
 
 def _check_players(agent: Any, env: Any) -> None:

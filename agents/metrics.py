@@ -8,6 +8,8 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from arcade_torch.models.arguments import is_number
+
 CURVE_POINTS = 1000  # equispaced points on the frame axis
 EWM_SPAN = 100  # in points of the curve (paper score) or in updates (running average)
 
@@ -60,8 +62,8 @@ def paper_score(frames: ArrayLike, returns: ArrayLike, max_frames: float | None 
         The score, in units of the undiscounted return.
 
     Raises:
-        ValueError: the history is empty, its two parts differ in length, or ``frames`` is not
-            finite and increasing.
+        ValueError: the history is empty, its two parts differ in length, ``frames`` is not finite
+            and increasing, ``returns`` not finite, or ``max_frames`` not above 0.
 
     Source: POPGym Arcade (ICML 2026), plotting of the reference implementation.
     """
@@ -74,6 +76,10 @@ def paper_score(frames: ArrayLike, returns: ArrayLike, max_frames: float | None 
         )
     if not (np.isfinite(x).all() and np.all(np.diff(x) > 0)):
         raise ValueError("frames must be finite and increase from row to row")
+    if not np.isfinite(y).all():
+        raise ValueError("returns must be finite")
+    if max_frames is not None and (not is_number(max_frames) or max_frames <= 0):
+        raise ValueError(f"max_frames must be a number above 0; got {max_frames!r}")
     grid = np.linspace(0.0, x[-1] if max_frames is None else max_frames, CURVE_POINTS)
     return float(ewm(np.interp(grid, x, y)).max())
 

@@ -2,12 +2,27 @@
 
 import copy
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from tensordict import TensorDictParams
 from torchrl.objectives import LossModule
 
-__all__ = ["NetworkLoss"]
+from arcade_torch.envs_jax.validation import kind_of
+
+__all__ = ["NetworkLoss", "Reduction", "check_actor"]
+
+Reduction = Literal["mean", "sum", "none"]
+"""How a loss makes one number of those of all steps."""
+
+
+def check_actor(network: Any) -> None:
+    """Refuse (TypeError) what draws no actions."""
+    if not hasattr(network, "get_dist"):
+        raise TypeError(
+            "actor_network must be a probabilistic TensorDict module, such as a "
+            f"ProbabilisticActor; got {kind_of(network)} (of an ActorValueOperator: "
+            "get_policy_operator(), get_value_operator())"
+        )
 
 
 class NetworkLoss(LossModule):

@@ -17,13 +17,14 @@ from torchrl.data import Categorical, Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule, ProbabilisticActor, QValueModule
 
-from arcade_torch.agents.checked import require
+from arcade_torch.agents.checked import Count, Fraction, coerce, require
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.forward import evaluating, last_outputs
 from arcade_torch.agents.runs.bundle import find_checkpoint
 from arcade_torch.agents.runs.checkpoint import Checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
-from arcade_torch.agents.torch_settings import plain_torch
+from arcade_torch.agents.torch_settings import device_of, plain_torch
+from arcade_torch.envs_jax.validation import plain
 from arcade_torch.models.actor_critic import (
     ActorCriticNetwork,
     current_names,
@@ -53,7 +54,16 @@ def make_policy(
     Returns:
         A TensorDict module that writes ``action`` int64 [*], and ``action_log_prob`` where it
         samples. Random numbers come from torch's global generator.
+
+    Raises:
+        ValueError: the network writes neither, or an argument is out of its range.
+        TypeError: the network is no TensorDict module.
     """
+    _check_writes(network, "action_value", "logits")
+    explore = coerce("explore", plain(explore), bool)
+    epsilon = coerce("epsilon", plain(epsilon), Fraction)
+    if num_actions is not None:
+        num_actions = coerce("num_actions", plain(num_actions), Count)
     if "logits" in getattr(network, "out_keys", ()):
         return make_actor(network, deterministic=not explore)
     greedy = QValueModule(action_space="categorical")
@@ -62,7 +72,7 @@ def make_policy(
     device = next((p.device for p in network.parameters()), None)
     actions = Categorical(num_actions or _num_outputs(network))
     host = torch.device("cpu")  # made there whatever torch's default device is, and then moved
-    exploring = EpsilonGreedy(actions, eps_init=float(epsilon), eps_end=0.0, device=host)
+    exploring = EpsilonGreedy(actions, eps_init=epsilon, eps_end=0.0, device=host)
     return TensorDictSequential(network, greedy, exploring.to(device))
 
 
@@ -75,7 +85,13 @@ def make_actor(network: TensorDictModuleBase, deterministic: bool = False) -> Pr
 
     Returns:
         TorchRL's ``ProbabilisticActor``; writes ``action`` int64 [*] and ``action_log_prob``.
+
+    Raises:
+        ValueError: the network does not write ``logits``.
+        TypeError: it is no TensorDict module.
     """
+    _check_writes(network, "logits")
+    deterministic = coerce("deterministic", plain(deterministic), bool)
     return ProbabilisticActor(
         network,
         in_keys=["logits"],
@@ -86,6 +102,20 @@ def make_actor(network: TensorDictModuleBase, deterministic: bool = False) -> Pr
         if deterministic
         else ExplorationType.RANDOM,
     )
+
+
+def _check_writes(network: Any, *names: str) -> None:
+    """Refuse what is no TensorDict module (TypeError), or writes none of some entries
+    (ValueError).
+    """
+    if not hasattr(network, "out_keys"):
+        raise TypeError(
+            f"a network must be a TensorDict module; got a {type(network).__name__}: "
+            "TensorDictModule(network, [what it reads], [what it writes])"
+        )
+    if not set(names) & set(network.out_keys):
+        written = ", ".join(map(str, network.out_keys))
+        raise ValueError(f"the network must write {' or '.join(names)}; it writes {written}")
 
 
 class Choice(CategoricalDistribution):
@@ -179,10 +209,10 @@ class Agent(TensorDictModuleBase):
             ``(action int64 [N], extras, new state)``, with the extras ``q_value`` float32 [N, A],
             or ``logits`` [N, A] and ``state_value`` [N].
         """
-        pixels = obs.get("pixels").unsqueeze(1)
+        pixels = obs["pixels"].unsqueeze(1)
         steps = pixels.shape[0], 1
-        last_action = obs.get("last_action").reshape(steps)
-        is_init = obs.get("is_init").reshape(steps)
+        last_action = obs["last_action"].reshape(steps)
+        is_init = obs["is_init"].reshape(steps)
         out, state = self.network.remember(self.network.encode(pixels), last_action, is_init, state)
         heads = self.network.by_head(out.squeeze(1))
         if "logits" in heads:
@@ -336,12 +366,15 @@ def load(path: str | PathLike[str], device: str | torch.device | None = None) ->
     Raises:
         CheckpointError: there is nothing to load at ``path``, or it is damaged; says what was
             found.
+        ValueError: there is no such device.
     """
     return agent_of(find_checkpoint(Path(path)), device)
 
 
 def agent_of(checkpoint: Checkpoint, device: str | torch.device | None = None) -> Agent:
     """The agent of a checkpoint, in evaluation mode; see `load`."""
+    if device is not None:
+        device = device_of(device)
     config = checkpoint.config
     network = build_network(replace(config, device="cpu", cuda_graphs=False))
     weights = checkpoint.weights

@@ -26,14 +26,14 @@ from arcade_torch.agents.batch_checks import (
     stored_numbers,
     with_mask,
 )
-from arcade_torch.agents.checked import coerce, require
+from arcade_torch.agents.checked import Finite, Positive, coerce, require
 from arcade_torch.agents.config import PPOConfig, TimeLimit
 from arcade_torch.agents.layout import NetworkInputs, as_steps, written
 from arcade_torch.agents.learner import Learner, Training
-from arcade_torch.agents.network_loss import NetworkLoss
+from arcade_torch.agents.network_loss import NetworkLoss, Reduction, check_actor
 from arcade_torch.agents.policy import make_actor
 from arcade_torch.agents.returns import SequenceGAE
-from arcade_torch.envs_jax.validation import kind_of
+from arcade_torch.envs_jax.validation import plain
 
 
 def ppo_objective(
@@ -133,6 +133,10 @@ class PPOLoss(NetworkLoss):
         functional: hold the parameters apart from the networks, as TorchRL's losses do; False saves
             that time.
 
+    Raises:
+        ValueError: an argument out of its range, or nothing writes the value.
+        TypeError: ``actor_network`` draws no actions, or a network is no TensorDict module.
+
     Source: Schulman et al., arXiv 1707.06347, equation 9. Equal to ``ClipPPOLoss`` with
     ``loss_critic_type="l2"``, ``clip_value=True`` and half its ``critic_coeff``, on the same batch.
     """
@@ -181,14 +185,9 @@ class PPOLoss(NetworkLoss):
         functional: bool = True,
     ) -> None:
         super().__init__()
-        self.functional = functional
+        self.functional = coerce("functional", functional, bool)
         self.critic_network = None
-        if not hasattr(actor_network, "get_dist"):
-            raise TypeError(
-                "actor_network must be a probabilistic TensorDict module, such as a "
-                f"ProbabilisticActor; got {kind_of(actor_network)} (of an "
-                "ActorValueOperator: get_policy_operator(), get_value_operator())"
-            )
+        check_actor(actor_network)
         if critic_network is None:
             require(
                 _may_write_value(actor_network, self.tensor_keys.value),
@@ -198,6 +197,7 @@ class PPOLoss(NetworkLoss):
             )
             self.inputs = NetworkInputs(actor_network)
         else:
+            NetworkInputs(critic_network)
             self.inputs = NetworkInputs(TensorDictSequential(actor_network, critic_network))
         if not functional:
             self.actor_network = actor_network
@@ -207,12 +207,16 @@ class PPOLoss(NetworkLoss):
             if critic_network is not None:
                 self.convert_to_functional(critic_network, "critic_network")
         self.time_limit = coerce("time_limit", time_limit, TimeLimit)
-        self.clip_value = clip_value
-        self.critic_coeff = critic_coeff
-        self.prediction_coeff = prediction_coeff
-        self.normalize_advantage = normalize_advantage
+        self.clip_value = coerce("clip_value", clip_value, bool)
+        self.critic_coeff = coerce("critic_coeff", plain(critic_coeff), Finite)
+        self.prediction_coeff = coerce("prediction_coeff", plain(prediction_coeff), Finite)
+        self.normalize_advantage = coerce("normalize_advantage", normalize_advantage, bool)
+        has_scale = advantage_norm is None or hasattr(advantage_norm, "scale")
+        require(has_scale, "advantage_norm", advantage_norm, "None or such as PopArtValueNorm")
         self.advantage_norm = advantage_norm
-        self.reduction = reduction
+        self.reduction = coerce("reduction", reduction, Reduction)
+        clip_epsilon = coerce("clip_epsilon", plain(clip_epsilon), Positive)
+        entropy_coeff = coerce("entropy_coeff", plain(entropy_coeff), Finite)
         device = next((p.device for p in self.parameters()), torch.device("cpu"))
         for name, number in (("clip_epsilon", clip_epsilon), ("entropy_coeff", entropy_coeff)):
             value = torch.full((), number, dtype=torch.float32, device=device)

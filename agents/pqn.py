@@ -26,7 +26,7 @@ from arcade_torch.agents.layout import (
     unroll,
 )
 from arcade_torch.agents.learner import Learner, Training
-from arcade_torch.agents.network_loss import NetworkLoss
+from arcade_torch.agents.network_loss import NetworkLoss, Reduction
 from arcade_torch.agents.returns import QLambdaEstimator
 
 
@@ -58,6 +58,10 @@ class PQNLoss(NetworkLoss):
         reduction: ``"mean"``, ``"sum"`` or ``"none"``.
         functional: hold the parameters apart from the network, as TorchRL's losses do; False saves
             that time.
+
+    Raises:
+        ValueError: an argument out of its range.
+        TypeError: the network is no TensorDict module.
 
     Source: Gallici et al., arXiv 2407.04811; POPGym Arcade (ICML 2026).
     """
@@ -99,7 +103,9 @@ class PQNLoss(NetworkLoss):
         functional: bool = True,
     ) -> None:
         super().__init__()
-        self.functional = functional
+        self.functional = coerce("functional", functional, bool)
+        delay_value = coerce("delay_value", delay_value, bool)
+        self.inputs = NetworkInputs(value_network)
         if functional:
             self.convert_to_functional(
                 value_network, "value_network", create_target_params=delay_value
@@ -107,7 +113,6 @@ class PQNLoss(NetworkLoss):
         else:
             require(not delay_value, "functional", functional, "True with delay_value")
             self.value_network = value_network
-        self.inputs = NetworkInputs(value_network)
         require(
             not burn_in or len(self.inputs.stores) < 2,
             "burn_in",
@@ -118,7 +123,7 @@ class PQNLoss(NetworkLoss):
         self.bootstrap = coerce("bootstrap", bootstrap, Bootstrap)
         self.delay_value = delay_value
         self.burn_in = coerce("burn_in", burn_in, CountOrZero)
-        self.reduction = reduction
+        self.reduction = coerce("reduction", reduction, Reduction)
         self._default_value_estimator()
 
     def _set_in_keys(self) -> None:

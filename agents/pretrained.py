@@ -47,7 +47,8 @@ def from_pretrained(
         The agent, in evaluation mode; see :func:`arcade_torch.agents.load`.
 
     Raises:
-        ValueError: ``sha256`` is no hash, or ``revision`` is given for a folder.
+        ValueError: ``sha256`` is no hash, ``revision`` is given for a folder, or there is no such
+            device.
         CheckpointError: there is no such agent, it is damaged or another one, or its memory model
             is not known here.
         HubError: the hub cannot be reached, or refuses.

@@ -18,7 +18,7 @@ import torch
 from safetensors.torch import load_file, save
 from tensordict import TensorDict, TensorDictBase
 
-from arcade_torch.agents.checked import require
+from arcade_torch.agents.checked import coerce, require
 from arcade_torch.agents.runs.files import (
     CheckpointError,
     checksum,
@@ -26,6 +26,8 @@ from arcade_torch.agents.runs.files import (
     is_ours,
     write_atomic,
 )
+from arcade_torch.agents.torch_settings import device_of
+from arcade_torch.envs_jax.validation import plain
 
 _OLD_LISTS = 2  # lists of segments kept for the checkpoints before the newest
 
@@ -53,11 +55,11 @@ class SequenceReplay:
         folder: where windows are written, made when first needed; None for a temporary folder.
     """
 
-    def __init__(self, capacity: int, folder: Path | None = None) -> None:
-        require(capacity >= 1, "capacity", capacity, "at least 1 sequence")
-        self.capacity = capacity
+    def __init__(self, capacity: int, folder: str | Path | None = None) -> None:
+        self.capacity = coerce("capacity", plain(capacity), int)
+        require(self.capacity >= 1, "capacity", capacity, "at least 1 sequence")
         self._temporary = tempfile.TemporaryDirectory() if folder is None else None
-        self._folder = folder or Path(self._temporary.name)  # type: ignore[union-attr]
+        self._folder = Path(folder or self._temporary.name)  # type: ignore[union-attr]
         self._segments: deque[_Segment] = deque()
         self._added = 0
         self._lists: deque[set[str]] = deque(maxlen=_OLD_LISTS)
@@ -109,13 +111,15 @@ class SequenceReplay:
         """Draw sequences uniformly, each at most once.
 
         Args:
-            count: B, at most the number at hand (else ValueError).
+            count: B, from 1 to the number at hand (else ValueError).
             generator: CPU generator of the draw.
             device: where to put them.
 
         Returns:
             Sequences [B], in the order of age.
         """
+        count = coerce("count", plain(count), int)
+        device = device_of(device)
         held = len(self)
         require(1 <= count <= held, "count", count, f"from 1 to the {held} sequences at hand")
         drawn_rows = torch.zeros(held, dtype=torch.bool, device="cpu")

@@ -12,9 +12,11 @@ from torch import Tensor, nn
 from torchrl.objectives.value import TDLambdaEstimator
 
 from arcade_torch.agents.batch_checks import is_stock
-from arcade_torch.agents.checked import Fraction, coerce, require
+from arcade_torch.agents.checked import Count, Fraction, coerce, require
 from arcade_torch.agents.config import TimeLimit
 from arcade_torch.agents.layout import NetworkInputs, insert_final_observations, unroll
+from arcade_torch.envs_jax.validation import format_value, plain
+from arcade_torch.models.arguments import is_number
 
 
 def q_lambda_return(
@@ -54,8 +56,8 @@ def q_lambda_return(
         float [B, T], in the dtype of ``reward``.
 
     Raises:
-        ValueError: shapes differ or are not [B, T]; integer rewards; ``gamma``, ``lam`` or
-            ``time_limit`` not as above.
+        ValueError: shapes differ or are not [B, T]; integer rewards; ends that are not bool;
+            ``gamma``, ``lam`` or ``time_limit`` not as above.
 
     Source: Peng & Williams (1996); PQN, Gallici et al., arXiv 2407.04811, section 3; POPGym Arcade
         (ICML 2026), PQN.
@@ -119,7 +121,7 @@ def gae(
     after, trace = values_and_traces(
         reward, next_value, terminated, truncated, gamma, lam, time_limit, value
     )
-    return solve_backward(reward + gamma * after - value, trace)
+    return solve_backward(reward + gamma * after - value.to(reward.dtype), trace)
 
 
 def values_and_traces(
@@ -136,6 +138,7 @@ def values_and_traces(
     lambda, 0 at every end and at the last step. Arguments that do not fit are refused, ``others``
     for their shape alone.
     """
+    _check_tensors(reward, next_value, terminated, truncated, *others)
     shapes = {tuple(x.shape) for x in (reward, next_value, terminated, truncated, *others)}
     if len(shapes) != 1 or reward.ndim != 2 or reward.shape[1] == 0:
         raise ValueError(
@@ -144,14 +147,37 @@ def values_and_traces(
         )
     if not reward.is_floating_point():  # traces were 0
         raise ValueError(f"the dtype of rewards must be a floating one; got {reward.dtype}")
-    if not (0.0 <= gamma <= 1.0 and 0.0 <= lam <= 1.0):
-        raise ValueError(f"gamma and lambda must be in [0, 1]; got {(gamma, lam)}")
+    if any(x.is_complex() or x.dtype == torch.bool for x in (next_value, *others)):
+        kinds = ", ".join(str(x.dtype) for x in (next_value, *others))
+        raise ValueError(f"the dtype of values must be a floating one; got {kinds}")
+    if terminated.dtype != torch.bool or truncated.dtype != torch.bool:
+        kinds = f"{terminated.dtype} and {truncated.dtype}"
+        raise ValueError(f"terminated and truncated must be bool; got {kinds}")
+    if not (_is_fraction(gamma) and _is_fraction(lam)):
+        given = format_value((gamma, lam))
+        raise ValueError(f"gamma and lambda must be in [0, 1]; got {given}")
     if time_limit not in ("bootstrap", "terminal"):
         raise ValueError(f"time_limit must be 'bootstrap' or 'terminal'; got {time_limit!r}")
     done = terminated | truncated
     trace = torch.full_like(reward, gamma * lam).masked_fill(done, 0.0)
     trace[:, -1] = 0.0
-    return next_value.masked_fill(done if time_limit == "terminal" else terminated, 0.0), trace
+    no_value = done if time_limit == "terminal" else terminated
+    return next_value.to(reward.dtype).masked_fill(no_value, 0.0), trace
+
+
+def _check_tensors(*values: Any) -> None:
+    """Refuse what is no tensor (ValueError)."""
+    for x in values:
+        if not isinstance(x, Tensor):
+            kind = type(x).__name__
+            raise ValueError(f"rewards, values and ends must be tensors [B, T]; got a {kind}")
+
+
+def _is_fraction(value: Any) -> bool:
+    """Whether a value is one number in [0, 1]."""
+    if isinstance(value, Tensor):
+        return value.numel() == 1 and bool((value >= 0.0) & (value <= 1.0))
+    return is_number(value) and 0.0 <= value <= 1.0
 
 
 def solve_backward(base: Tensor, trace: Tensor) -> Tensor:
@@ -251,6 +277,10 @@ class SequenceGAE(nn.Module):
         time_limit: ``"bootstrap"``: a truncation keeps the value of its final frame;
             ``"terminal"``: it terminates.
         chunks: parts that the rows are read in, which bounds memory.
+
+    Raises:
+        ValueError: an argument out of its range.
+        TypeError: the critic is no TensorDict module.
     """
 
     def __init__(
@@ -267,7 +297,7 @@ class SequenceGAE(nn.Module):
         self.time_limit = coerce("time_limit", time_limit, TimeLimit)
         self.gamma = discount("gamma", gamma)
         self.lmbda = discount("lmbda", lmbda)
-        self.chunks = chunks
+        self.chunks = coerce("chunks", plain(chunks), Count)
         self.names: dict[str, Any] = {key: key for key in (*_READ, *_WRITTEN)}
         self.names["value"] = "state_value"
 

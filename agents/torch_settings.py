@@ -1,4 +1,6 @@
-"""The settings of torch that a run computes under, whatever the process or the caller has set."""
+"""The settings of torch that a run computes under, whatever the process or the caller has set, and
+the device that somebody names.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -8,13 +10,34 @@ import torch
 
 from arcade_torch.models.generators import ONE_AT_A_TIME
 
-__all__ = ["Settings", "given_back", "plain_torch"]
+__all__ = ["Settings", "device_of", "given_back", "plain_torch"]
 
 Settings = dict[Callable[[Any], object], Any]
 """What sets a setting of the process -> its value before."""
 
 _OPEN: list[Settings] = []
 """What the runs in this process have to give back, in the order in which they began."""
+
+
+def device_of(device: Any) -> torch.device:
+    """The device of a name.
+
+    Raises:
+        ValueError: there is none of this name, or not here.
+
+    Example:
+        >>> device_of("cpu")
+        device(type='cpu')
+    """
+    try:
+        named = torch.device(device)
+        torch.empty(0, device=named)
+    except (RuntimeError, AssertionError, TypeError, ValueError, OverflowError) as error:
+        reason = str(error).partition("\n")[0][:120]
+        raise ValueError(
+            f"device is {device!r}, expected one that is here, such as 'cpu' ({reason})"
+        ) from error
+    return named
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 from torchrl.modules import set_recurrent_mode
 
-from arcade_torch.collector_arguments import check_arguments
+from arcade_torch.collector_arguments import check_arguments, check_options, check_random_frames
 from arcade_torch.compiled import TERMINATED, TRUNCATED
 from arcade_torch.dlpack import is_host, to_torch
 from arcade_torch.env import ArcadeEnv
@@ -111,6 +111,7 @@ class ArcadeCollector(BaseCollector):
         exploration_type: ExplorationType = ExplorationType.RANDOM,
         post_collect_hook: Callable[[TensorDictBase], None] | None = None,
     ) -> None:
+        check_options(exploration_type, store, compress, post_collect_hook)
         super().__init__(post_collect_hook=post_collect_hook)
         frames_per_batch = whole("frames_per_batch", frames_per_batch)
         total_frames = whole("total_frames", total_frames)
@@ -125,7 +126,7 @@ class ArcadeCollector(BaseCollector):
         self.frames_per_batch = frames_per_batch
         self.requested_frames_per_batch = frames_per_batch
         self.total_frames = float("inf") if total_frames < 0 else total_frames
-        self.init_random_frames = init_random_frames
+        self.init_random_frames = check_random_frames(init_random_frames)
         self.return_same_td = return_same_td
         self.compact_obs = compact_obs
         self.exploration_type = exploration_type

@@ -1,13 +1,16 @@
 """What ``ArcadeCollector`` refuses, in one clear line each."""
 
 import inspect
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any, get_args
+
+from torchrl.envs.utils import ExplorationType
 
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.jax_env import JaxEnv
 from arcade_torch.rollout_buffer import FinalFrames
+from arcade_torch.validation import whole
 
 
 def _parameters(policy: Any) -> Collection[str]:
@@ -18,6 +21,35 @@ def _parameters(policy: Any) -> Collection[str]:
         return inspect.signature(getattr(policy, "forward", policy)).parameters
     except (TypeError, ValueError):  # of a function that is compiled
         return ()
+
+
+def check_random_frames(init_random_frames: Any) -> int:
+    """The number of random frames; raises unless it is a whole number from 0."""
+    frames = whole("init_random_frames", init_random_frames)
+    if frames < 0:
+        raise ValueError(f"init_random_frames is {frames}, expected an int of 0 or more")
+    return frames
+
+
+def check_options(exploration_type: Any, store: Any, compress: Any, hook: Any) -> None:
+    """Raise TypeError for options that a window would trip over."""
+    if exploration_type is not None and not isinstance(exploration_type, ExplorationType):
+        raise TypeError(
+            f"exploration_type is {exploration_type!r}, expected one of torchrl's ExplorationType"
+        )
+    if store is not None and not isinstance(store, Iterator):  # which is read once
+        is_list = isinstance(store, Iterable) and not isinstance(store, str)
+        if not is_list or not all(map(_is_key, store)):
+            raise TypeError(f"store is {store!r}, expected a list of keys, or None for all")
+    for name, function in (("compress", compress), ("post_collect_hook", hook)):
+        if function is not None and not callable(function):
+            raise TypeError(f"{name} is a {type(function).__name__}, expected a function")
+
+
+def _is_key(key: Any) -> bool:
+    """Whether it can be the key of an entry."""
+    parts = key if isinstance(key, tuple) else (key,)
+    return all(isinstance(part, str) for part in parts)
 
 
 def check_arguments(

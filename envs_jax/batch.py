@@ -23,7 +23,7 @@ from arcade_torch.envs_jax.game import (
     laid_out_as,
 )
 from arcade_torch.envs_jax.settings import compiled, fixed, is_key, may_be_nan, raw_key
-from arcade_torch.envs_jax.validation import format_value, plain
+from arcade_torch.envs_jax.validation import check_num_envs, format_value, plain
 
 State = TypeVar("State")
 
@@ -67,8 +67,8 @@ def env_keys(seed: int, num_envs: int, first: int = 0) -> Array:
         uint32 [num_envs, 2].
 
     Raises:
-        TypeError: The seed is no whole number.
-        ValueError: The seed is out of range.
+        TypeError: The seed or the number is no whole number.
+        ValueError: The seed or the number is out of range.
 
     Example:
         >>> bool((env_keys(3, 8)[5:] == env_keys(3, 3, first=5)).all())
@@ -81,6 +81,7 @@ def env_keys(seed: int, num_envs: int, first: int = 0) -> Array:
         )
     if not 0 <= seed < 2**32:
         raise ValueError(f"seed is {seed}, allowed: 0 to 4294967295")
+    num_envs = check_num_envs(num_envs)
     index = jnp.arange(first, first + num_envs, dtype=jnp.uint32)
     of_seed = jnp.array([0, seed], jnp.uint32)  # threefry's, whatever JAX is told to add to seeds
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(of_seed, index)

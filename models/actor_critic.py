@@ -8,9 +8,10 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 
+from arcade_torch.models.arguments import is_whole
 from arcade_torch.models.memory import batch_shape
 from arcade_torch.models.networks import MemoryNetwork
-from arcade_torch.models.presets import make_network, preset_of
+from arcade_torch.models.presets import NetworkPreset, make_network, preset_of
 from arcade_torch.models.recurrence import Key, Store
 
 __all__ = ["ActorCriticNetwork", "current_names", "make_actor_critic"]
@@ -34,7 +35,8 @@ class ActorCriticNetwork(TensorDictModuleBase):
         offers: what :meth:`select` can read an output as.
 
     Raises:
-        ValueError: without a critic, the actor has no head ``state_value``.
+        ValueError: without a critic, the actor has no head ``state_value``; with one, they write
+            something else than their heads, share state keys, or see frames of another size.
 
     Source: POPGym Arcade (ICML 2026), PPO network table; the reference implementation's recurrent
         actor-critic.
@@ -45,6 +47,7 @@ class ActorCriticNetwork(TensorDictModuleBase):
     def __init__(self, actor: MemoryNetwork, critic: MemoryNetwork | None = None) -> None:
         super().__init__()
         if critic is not None:
+            _check_towers(actor, critic)
             towers = {"actor": actor, "critic": critic}
         elif {"logits", "state_value"} <= actor.heads.keys():
             towers = {"both": actor}
@@ -161,6 +164,27 @@ class ActorCriticNetwork(TensorDictModuleBase):
         return towers["both"].only(head) if "both" in towers else towers[tower]
 
 
+def _check_towers(actor: MemoryNetwork, critic: MemoryNetwork) -> None:
+    """Raise ValueError unless two networks can be actor and critic."""
+    if "logits" not in actor.heads or "state_value" not in critic.heads:
+        heads = [", ".join(map(str, tower.heads)) for tower in (actor, critic)]
+        raise ValueError(
+            "the actor must write logits, and the critic state_value (out_key), got "
+            f"{heads[0]} and {heads[1]}"
+        )
+    shared = set(actor.state_keys) & set(critic.state_keys)
+    if shared:
+        raise ValueError(
+            "the state keys of actor and critic must differ, got "
+            f"{', '.join(map(str, sorted(shared)))} in both: give each a state_key"
+        )
+    if actor.obs_size != critic.obs_size:
+        raise ValueError(
+            f"actor and critic see frames of {actor.obs_size} and of {critic.obs_size} pixels, "
+            "which must be the same"
+        )
+
+
 OLD_NAMES = {
     "actor.module.0.": "towers.both.",
     "actor.": "towers.actor.",
@@ -193,6 +217,20 @@ def _rename_weights(network: nn.Module, weights: dict[str, Any], prefix: str, *_
     weights.update(renamed)
 
 
+def _check_options(options: dict[str, Any], num_actions: Any) -> None:
+    """Refuse options that two towers would drop in silence, and a number of actions below 1."""
+    unknown = sorted(set(options) - set(NetworkPreset.__dataclass_fields__))
+    if unknown:
+        raise TypeError(
+            f"unknown network option {', '.join(unknown)}; allowed are "
+            f"{', '.join(NetworkPreset.__dataclass_fields__)}"
+        )
+    if "head" in options and "actor_critic_head" in options:
+        raise ValueError("head and actor_critic_head are two names of one option: give one")
+    if not is_whole(num_actions) or num_actions < 1:
+        raise ValueError(f"num_actions must be a whole number from 1, got {num_actions!r}")
+
+
 def make_actor_critic(
     preset: str = "paper",
     memory: str | Callable[..., nn.Module] = "lru",
@@ -214,8 +252,8 @@ def make_actor_critic(
         num_actions: A.
         memory_options: options of the cells, over those of the preset.
         store: see :func:`make_network`.
-        **options: see :func:`make_network`; ``use_last_action=False`` is the published code, unlike
-            its table.
+        **options: the other fields of :class:`NetworkPreset`, see :func:`make_network`;
+            ``use_last_action=False`` is the published code, unlike its table.
 
     Returns:
         The module; states stand under ``("memory", "actor")`` and ``("memory", "critic")``, or
@@ -236,6 +274,7 @@ def make_actor_critic(
         torch.Size([2, 7, 5])
     """
     settings = preset_of(preset)
+    _check_options(options, num_actions)
     options.setdefault("head", options.pop("actor_critic_head", settings.actor_critic_head))
     options |= {
         "obs_size": obs_size,

@@ -7,6 +7,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_flags, check_sizes
 from arcade_torch.models.memory import Memory, replay_by_steps
 from arcade_torch.models.rotary import angles, rotate, rotate_pairs
 
@@ -54,6 +55,8 @@ class Attention(Memory):
         self, input_size: int, hidden_size: int, *, window: int = 128, carry_cache: bool = True
     ) -> None:
         super().__init__(input_size, hidden_size)
+        check_sizes(window=window)
+        check_flags(carry_cache=carry_cache)
         if window < 1:
             raise ValueError(f"window must be at least 1 step (the current one), got {window}")
         self.window = window

@@ -5,6 +5,7 @@ import math
 import torch
 from torch import Tensor, nn
 
+from arcade_torch.models.arguments import is_number
 from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan import linear_scan
 
@@ -71,7 +72,7 @@ class BMRU(Memory):
 
     def __init__(self, input_size: int, hidden_size: int, *, slope: float = 8.0) -> None:
         super().__init__(input_size, hidden_size)
-        if not 0 < slope < math.inf:
+        if not is_number(slope) or slope <= 0:
             raise ValueError(f"slope must be a number above 0, got {slope!r}")
         self.slope = slope
         self.state_shape = (hidden_size,)

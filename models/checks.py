@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
+from arcade_torch.models.arguments import check_flags, check_seed
 from arcade_torch.models.generators import kept_generators
 from arcade_torch.models.law_subject import MemoryLawError, subject_of
 from arcade_torch.models.laws import laws_of
@@ -50,8 +51,9 @@ def check_memory(
 
     Raises:
         MemoryLawError: a law is broken; says which, by how much, and what usually causes it.
-        ValueError, TypeError: the input size is not known, or ``dtype`` is none of the four; there
-            is no ``initial_state``, or a part is quantised.
+        ValueError: the input size is not known, ``dtype`` is none of the four, or another argument
+            is none of its kind.
+        TypeError: no ``nn.Module``, one without ``initial_state``, or one with a quantised part.
 
     Example:
         >>> from arcade_torch.models import check_memory, make_memory
@@ -59,6 +61,8 @@ def check_memory(
         ['batch rows are independent', 'equal calls give equal results']
     """
     subject = subject_of(module, input_size, dtype, tolerance)
+    check_flags(gradients=gradients)
+    check_seed(seed)
     discrepancies = {}
     with kept_generators(seed):
         for name, law in laws_of(module, subject.dtype, gradients).items():
@@ -93,8 +97,8 @@ def law_results(
         breaks it.
 
     Raises:
-        ValueError, TypeError: the input size is not known; there is no ``initial_state``, or a part
-            is quantised.
+        ValueError: the input size is not known, or another argument is none of its kind.
+        TypeError: no ``nn.Module``, one without ``initial_state``, or one with a quantised part.
 
     Example:
         >>> from arcade_torch.models import make_memory
@@ -102,6 +106,7 @@ def law_results(
         True
     """
     subject = subject_of(module, input_size, torch.float64, None)
+    check_seed(seed)
     results = []
     with kept_generators(seed):
         for name, law in laws_of(module, subject.dtype, True).items():

@@ -3,6 +3,7 @@
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_sizes
 from arcade_torch.models.fast_weights import unit_length
 from arcade_torch.models.gdn import SLOW_FORGETTING, GatedDeltaNet
 from arcade_torch.models.scan_matrix import (
@@ -52,6 +53,7 @@ class DeltaProduct(GatedDeltaNet):
         super().__init__(
             input_size, hidden_size, key_size=key_size, gate_alpha=gate_alpha, beta_range=beta_range
         )
+        check_sizes(householders=householders)
         if householders < 1:
             raise ValueError(f"householders must be positive, got {householders}")
         self.householders = householders

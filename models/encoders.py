@@ -5,9 +5,13 @@ from random play (``calibrate``); both do nothing where there is nothing to do. 
 range 0..255 are accepted as well, and gradients reach them.
 """
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
+
+from arcade_torch.models.arguments import check_sizes, is_whole
 
 __all__ = ["Encoder", "PaperEncoder", "SmallEncoder"]
 
@@ -65,7 +69,8 @@ class Encoder(nn.Module):
             float [..., E], dtype of the parameters.
 
         Raises:
-            ValueError: the last three dimensions are neither, or the frames are floats in 0..1.
+            ValueError: the last three dimensions are neither, the frames are floats in 0..1, or
+                neither uint8 nor floats.
         """
         frames = self._frames(pixels)
         if self.amp:
@@ -82,9 +87,21 @@ class Encoder(nn.Module):
 
     def _frames(self, pixels: Tensor) -> Tensor:
         """Compressed frames with one batch dimension, [N, *stored_shape]."""
+        self._check_frames(pixels)
+        _check_floats(pixels)
+        frames = pixels.reshape(-1, *pixels.shape[-3:])
+        return frames if self._is_stored(pixels) else self.compress(frames)
+
+    def _is_stored(self, pixels: Tensor) -> bool:
+        """Whether frames are compressed."""
+        return tuple(pixels.shape[-3:]) == self.stored_shape
+
+    def _check_frames(self, pixels: Any) -> None:
+        """Raise ValueError unless these are frames, full or compressed, of bytes or floats."""
+        if not isinstance(pixels, Tensor):
+            raise ValueError(f"frames must be a tensor, got {type(pixels)}")
         shape = tuple(pixels.shape[-3:])
-        is_stored = shape == self.stored_shape
-        if not is_stored and shape not in [(side, side, 3) for side in self.sides]:
+        if not self._is_stored(pixels) and shape not in [(side, side, 3) for side in self.sides]:
             size = f"[..., {self.obs_size}, {self.obs_size}, 3]"
             stored = f"[..., {', '.join(map(str, self.stored_shape))}]"
             raise ValueError(
@@ -92,9 +109,8 @@ class Encoder(nn.Module):
                 + ("" if stored == size else f" or compressed {stored}")
                 + f", got {list(pixels.shape)}"
             )
-        _check_floats(pixels)
-        frames = pixels.reshape(-1, *shape)
-        return frames if is_stored else self.compress(frames)
+        if pixels.dtype != torch.uint8 and not pixels.is_floating_point():
+            raise ValueError(f"frames must be uint8 or floats, from 0 to 255, got {pixels.dtype}")
 
 
 def _check_floats(pixels: Tensor) -> None:
@@ -165,7 +181,7 @@ class PaperEncoder(Encoder):
     """
 
     def __init__(self, obs_size: int = 128) -> None:
-        if obs_size not in _PAPER_LAYERS:
+        if not is_whole(obs_size) or obs_size not in _PAPER_LAYERS:
             raise ValueError(f"the paper's encoder exists for obs_size 128 and 256, got {obs_size}")
         seen = _side_seen(_PAPER_LAYERS[obs_size])
         side = seen + seen % 2
@@ -186,7 +202,11 @@ class PaperEncoder(Encoder):
 
         Returns:
             a view, [..., s, s, 3] with s = 120 for S = 128 and 218 for 256.
+
+        Raises:
+            ValueError: no frames of this size, neither full nor compressed.
         """
+        self._check_frames(pixels)
         rows, columns, _ = self.stored_shape
         return pixels[..., :rows, :columns, :]
 
@@ -216,11 +236,15 @@ class SmallEncoder(Encoder):
         channels: of a patch.
 
     Raises:
-        ValueError: another size.
+        ValueError: another size, or no channels.
     """
 
     def __init__(self, obs_size: int = 128, side: int = 32, channels: int = 32) -> None:
-        if side not in (32, 64) or obs_size not in (32, 64, 128, 256) or side > obs_size:
+        check_sizes(side=side)
+        if not is_whole(channels) or channels < 1:
+            raise ValueError(f"channels must be a whole number from 1, got {channels!r}")
+        is_size = is_whole(obs_size) and obs_size in (32, 64, 128, 256)
+        if side not in (32, 64) or not is_size or side > obs_size:
             raise ValueError(
                 "obs_size must be 32, 64, 128 or 256, and side 32 or 64 and no larger; got "
                 f"{obs_size} and {side}"
@@ -241,12 +265,18 @@ class SmallEncoder(Encoder):
         """Average pooling, and the order of patches.
 
         Args:
-            pixels: uint8 (floor of the mean) or float (the mean, differentiable) [..., S, S, 3], or
-                pooled already, [..., side, side, 3].
+            pixels: uint8 (floor of the mean) or float (the mean, differentiable) [..., S, S, 3],
+                pooled already, [..., side, side, 3], or compressed already.
 
         Returns:
             same dtype, [..., 8, 8, k * k * 3].
+
+        Raises:
+            ValueError: none of these.
         """
+        self._check_frames(pixels)
+        if self._is_stored(pixels):
+            return pixels
         lead = pixels.shape[:-3]
         if pixels.is_floating_point():
             block = pixels.shape[-2] // self.side
@@ -289,10 +319,11 @@ class SmallEncoder(Encoder):
         """Set mean and RMS from frames of random play (3,200 frames are plenty).
 
         Args:
-            pixels: uint8, full [..., S, S, 3] or compressed [..., 8, 8, k * k * 3].
+            pixels: uint8 or float (0..255), full [..., S, S, 3] or compressed [..., 8, 8, k * k *
+                3].
 
         Raises:
-            ValueError: no frames, or of another size.
+            ValueError: no frames, of another size, or with entries that are NaN or infinite.
         """
         chunks = pixels.reshape(-1, *pixels.shape[-3:]).split(256)
         frames = torch.cat([self._frames(chunk) for chunk in chunks])
@@ -300,6 +331,8 @@ class SmallEncoder(Encoder):
             raise ValueError("calibrate needs at least one frame, got none")
         centred = frames.to(self.mean.device, torch.float64)
         mean = centred.mean(0)
+        if not mean.isfinite().all():
+            raise ValueError("frames must be finite, got NaN or infinity")
         # one grey level: frames that never change
         rms = (centred - mean).square().mean().sqrt().clamp_min(1.0)
         patch = self.side // PATCHES

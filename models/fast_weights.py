@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from arcade_torch.models.arguments import check_sizes
 from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan_matrix import MatrixSteps, matrix_scan, matrix_scan_stored
 
@@ -32,6 +33,7 @@ class FastWeights(Memory):
     def __init__(self, input_size: int, hidden_size: int, key_size: int | None) -> None:
         super().__init__(input_size, hidden_size)
         self.key_size = max(1, round(math.sqrt(hidden_size))) if key_size is None else key_size
+        check_sizes(key_size=self.key_size)
         if self.key_size < 1:
             raise ValueError(f"key_size must be positive, got {key_size}")
         self.state_shape = (self.key_size, self.key_size)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_sizes
 from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan import linear_scan
 
@@ -53,6 +54,7 @@ class FFM(Memory):
     ) -> None:
         super().__init__(input_size, hidden_size)
         traces = max(2, round(hidden_size / 8)) if trace_size is None else trace_size
+        check_sizes(trace_size=traces, context_size=context_size)
         if traces < 1 or context_size < 1:
             raise ValueError(
                 f"trace_size and context_size must be positive, got {trace_size} and {context_size}"

@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_sizes
 from arcade_torch.models.memory import Memory
 
 __all__ = ["FrameStack", "last_inputs"]
@@ -31,6 +32,7 @@ class FrameStack(Memory):
 
     def __init__(self, input_size: int, hidden_size: int, *, frames: int = 4) -> None:
         super().__init__(input_size, hidden_size)
+        check_sizes(frames=frames)
         if frames < 2:
             raise ValueError(
                 f"frames must be at least 2 (the current one and the one before), got {frames}; "

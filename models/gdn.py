@@ -3,6 +3,7 @@
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_flags, is_number
 from arcade_torch.models.fast_weights import FastWeights, unit_length
 from arcade_torch.models.scan_matrix import MatrixSteps, matrix_scan_loop
 
@@ -50,7 +51,8 @@ class GatedDeltaNet(FastWeights):
         legacy_left: bool = False,
     ) -> None:
         super().__init__(input_size, hidden_size, key_size)
-        if not 0 < beta_range <= 2:
+        check_flags(gate_alpha=gate_alpha, legacy_left=legacy_left)
+        if not is_number(beta_range) or not 0 < beta_range <= 2:
             raise ValueError(
                 f"beta_range must lie in (0, 2], beyond which the memory explodes; got {beta_range}"
             )

@@ -5,6 +5,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_numbers
 from arcade_torch.models.attention import Attention
 from arcade_torch.models.memory import Memory, replay_by_steps
 
@@ -27,7 +28,7 @@ class GTrXL(Memory):
         gate_bias: initial bias of the gates; the larger, the less the layer does at first.
 
     Raises:
-        ValueError: a size or the window is not positive.
+        ValueError: a size or the window is not positive, or the bias no number.
 
     Source: Parisotto et al. (2019), arXiv 1910.06764, sections 3.1 (order of the norms) and 3.2
         (gates, "GRU-type").
@@ -39,6 +40,7 @@ class GTrXL(Memory):
         self, input_size: int, hidden_size: int, *, window: int = 128, gate_bias: float = 2.0
     ) -> None:
         super().__init__(input_size, hidden_size)
+        check_numbers(gate_bias=gate_bias)
         same = input_size == hidden_size
         self.embed = nn.Identity() if same else nn.Linear(input_size, hidden_size, bias=False)
         self.attention_norm = nn.LayerNorm(hidden_size)

@@ -1,7 +1,6 @@
 """What the laws of a memory model are put to, a copy of the module; the error of a broken law."""
 
 import copy
-import operator
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,6 +9,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+
+from arcade_torch.models.arguments import check_numbers, is_whole
 
 __all__ = ["MemoryLawError", "Subject", "copy_of", "held_by", "leaves", "pairs_of", "subject_of"]
 
@@ -109,16 +110,14 @@ class Subject:
 
 
 def subject_of(
-    module: nn.Module, input_size: int | None, dtype: torch.dtype, tolerance: float | None
+    module: Any, input_size: int | None, dtype: torch.dtype, tolerance: float | None
 ) -> Subject:
     """The copy of a module that is checked."""
-    given: Any = getattr(module, "input_size", None) if input_size is None else input_size
-    try:
-        size = operator.index(given)  # also of numpy
-    except TypeError as error:
-        raise ValueError(
-            "input size unknown: pass check_memory(module, input_size=...) or set module.input_size"
-        ) from error
+    if not isinstance(module, nn.Module):
+        is_class = isinstance(module, type)
+        got = f"the class {module.__name__}: make one of it" if is_class else repr(module)
+        raise TypeError(f"a memory model must be an nn.Module, got {got}")
+    size = _input_size(module, input_size)
     if not hasattr(module, "initial_state"):
         raise TypeError(
             f"{type(module).__name__} has no initial_state(batch_size), which gives a TensorDict"
@@ -138,11 +137,28 @@ def subject_of(
         dtype = torch.float32  # there is nothing to convert, so its states are what they are
     if tolerance is None:
         tolerance = TOLERANCES[dtype]
+    check_numbers(tolerance=tolerance)
+    if tolerance < 0:
+        raise ValueError(f"tolerance must be a number from 0, got {tolerance}")
     # not ``.to(dtype)``, which takes the imaginary part away from complex weights
     convert = partial(_in_precision, dtype=dtype)
     checked = copy_of(module, convert).eval()
     checked._apply(convert)
     return Subject(checked, size, dtype, tolerance, original=copy_of(module).eval())
+
+
+def _input_size(module: nn.Module, given: int | None) -> int:
+    """D, as given or as the module has it."""
+    if given is not None:
+        if not is_whole(given) or given < 1:
+            raise ValueError(f"input_size must be a whole number from 1, got {given!r}")
+        return int(given)
+    size: Any = getattr(module, "input_size", None)
+    if not is_whole(size):
+        raise ValueError(
+            "input size unknown: pass check_memory(module, input_size=...) or set module.input_size"
+        )
+    return int(size)
 
 
 def copy_of(module: nn.Module, convert: Callable[[Tensor], Tensor] = torch.detach) -> nn.Module:

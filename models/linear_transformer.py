@@ -4,6 +4,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_flags
 from arcade_torch.models.fast_weights import FastWeights
 from arcade_torch.models.scan_matrix import MatrixSteps
 
@@ -47,6 +48,7 @@ class LinearTransformer(FastWeights):
         legacy_normaliser: bool = False,
     ) -> None:
         super().__init__(input_size, hidden_size, key_size)
+        check_flags(legacy_normaliser=legacy_normaliser)
         self.legacy_normaliser = legacy_normaliser
         if not legacy_normaliser:
             self.state_shape = (self.key_size, self.key_size + 1)

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_numbers
 from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan import linear_scan
 
@@ -19,18 +20,21 @@ def ring(size: int, r_min: float, r_max: float, max_phase: float) -> tuple[Tenso
         size: how many.
         r_min: inner radius, in [0, r_max).
         r_max: outer radius, in (r_min, 1].
-        max_phase: phases are uniform in [0, max_phase] radians.
+        max_phase: phases are uniform in [0, max_phase] radians; at least 0.
 
     Returns:
         (squares of their radii, phases), float [size]; kept away from 0 and 1, for logarithms.
 
     Raises:
-        ValueError: radii out of range.
+        ValueError: radii or phase out of range.
 
     Source: Orvieto et al. (2023), arXiv 2303.06349, lemma 3.2.
     """
+    check_numbers(r_min=r_min, r_max=r_max, max_phase=max_phase)
     if not 0 <= r_min < r_max <= 1:
         raise ValueError(f"need 0 <= r_min < r_max <= 1, got r_min={r_min}, r_max={r_max}")
+    if max_phase < 0:
+        raise ValueError(f"max_phase must be a number of radians from 0, got {max_phase}")
     square = (torch.rand(size) * (r_max**2 - r_min**2) + r_min**2).clamp(1e-8, 1 - 1e-6)
     phase = (max_phase * torch.rand(size)).clamp_min(1e-8)
     return square, phase
@@ -53,7 +57,7 @@ class LRU(Memory):
         max_phase: initial phases are uniform in [0, max_phase] radians.
 
     Raises:
-        ValueError: sizes or radii out of range.
+        ValueError: sizes, radii or phase out of range.
 
     Source: Orvieto et al. (2023), arXiv 2303.06349, eq. 8 and lemma 3.2.
     """

@@ -7,6 +7,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_sizes
 from arcade_torch.models.frame_stack import last_inputs
 from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan import linear_scan
@@ -54,6 +55,7 @@ class Mamba(Memory):
         conv: int = 4,
     ) -> None:
         super().__init__(input_size, hidden_size)
+        check_sizes(state_size=state_size, expand=expand, conv=conv)
         if state_size < 1 or expand < 1:
             raise ValueError(
                 f"sizes must be positive, got state_size={state_size}, expand={expand}"

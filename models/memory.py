@@ -7,6 +7,8 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from arcade_torch.models.arguments import check_sizes, is_whole
+
 __all__ = [
     "Memory", "MemoryContract", "ReplayableMemory", "batch_shape", "first_state", "replay",
     "replay_by_steps",
@@ -101,7 +103,7 @@ class Memory(nn.Module):
         hidden_size: H, features of the output.
 
     Raises:
-        ValueError: a size is not positive.
+        ValueError: a size is no whole number, or not positive.
     """
 
     state_shape: tuple[int, ...] | None = None
@@ -114,6 +116,7 @@ class Memory(nn.Module):
 
     def __init__(self, input_size: int, hidden_size: int) -> None:
         super().__init__()
+        check_sizes(input_size=input_size, hidden_size=hidden_size)
         if input_size < 1 or hidden_size < 1:
             raise ValueError(
                 f"sizes must be positive, got input_size={input_size}, hidden_size={hidden_size}"
@@ -162,12 +165,16 @@ class Memory(nn.Module):
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
         """Zeros: TensorDict [batch_size] with :meth:`state_leaves`, in the parameters' dtype and on
         their device.
+
+        Raises:
+            ValueError: ``batch_size`` is no whole number from 0, nor several.
         """
         batch = batch_shape(batch_size)
         state = TensorDict({}, batch_size=batch)
         for name, (shape, dtype) in self.state_leaves().items():
+            sizes = (*batch, *shape)
             state[name] = torch.zeros(
-                *batch, *shape, dtype=dtype or self.like.dtype, device=self.like.device
+                sizes, dtype=dtype or self.like.dtype, device=self.like.device
             )
         return state
 
@@ -179,7 +186,9 @@ class Memory(nn.Module):
         _check_start_flags(is_init, x)
         self._check_state(state, x.shape[:batch_ndim])
 
-    def _check_input(self, x: Tensor) -> None:
+    def _check_input(self, x: Any) -> None:
+        if not isinstance(x, Tensor):
+            raise ValueError(f"x must be a tensor [B, T, {self.input_size}], got {type(x)}")
         if x.ndim != 3 or x.shape[-1] != self.input_size:
             raise ValueError(
                 f"x must be [B, T, {self.input_size}], got {list(x.shape)} (acting is T = 1)"
@@ -214,6 +223,13 @@ class Memory(nn.Module):
                 f"the state of {type(self).__name__} must be {expected}, got {given}: "
                 "it belongs to another model or batch size; begin with initial_state(batch_size)"
             )
+        for name, (_, dtype) in self.state_leaves().items():
+            expected_dtype = dtype or self.like.dtype
+            if state[name].dtype != expected_dtype:
+                raise ValueError(
+                    f"{name!r} of the state must be {expected_dtype}, got {state[name].dtype}: "
+                    "cast the state with the model"
+                )
 
     def extra_repr(self) -> str:
         """Sizes, for printing."""
@@ -235,8 +251,15 @@ def _check_start_flags(is_init: Any, x: Tensor) -> None:
 
 
 def batch_shape(batch_size: int | Sequence[int]) -> list[int]:
-    """A batch size, one number or several, as a list."""
-    return list(batch_size) if isinstance(batch_size, Sequence) else [batch_size]
+    """A batch size, one number or several, as a list.
+
+    Raises:
+        ValueError: they are not whole numbers from 0.
+    """
+    sizes = list(batch_size) if isinstance(batch_size, Sequence) else [batch_size]
+    if not all(is_whole(size) and size >= 0 for size in sizes):
+        raise ValueError(f"batch_size must be whole numbers from 0, got {batch_size!r}")
+    return sizes
 
 
 def first_state(memory: nn.Module, batch_size: int | Sequence[int]) -> TensorDict:

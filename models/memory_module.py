@@ -8,6 +8,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import unravel_key
 from torch import nn
 
+from arcade_torch.models.arguments import check_flags, check_keys
 from arcade_torch.models.recurrence import Key, Recurrence, Store
 
 if TYPE_CHECKING:
@@ -52,7 +53,9 @@ class MemoryModule(TensorDictModuleBase):
             recurrent state in sequential mode, where the batch shows it.
 
     Raises:
-        ValueError: unknown ``store``, or "step" for a memory whose start is not zeros, or learned.
+        ValueError: unknown ``store``, "step" for a memory whose start is not zeros, or learned, or
+            a key or a switch that is none.
+        TypeError: the module is no memory model.
 
     Source: TorchRL's recurrent-state life cycle, ``LSTMModule`` and ``GRUModule``.
 
@@ -89,6 +92,8 @@ class MemoryModule(TensorDictModuleBase):
         check_sequences: bool = True,
     ) -> None:
         super().__init__()
+        check_flags(default_recurrent_mode=default_recurrent_mode, check_sequences=check_sequences)
+        check_keys(in_key=in_key, out_key=out_key, state_key=state_key, is_init_key=is_init_key)
         self.memory = memory
         self.in_key = unravel_key(in_key)
         self.out_key = unravel_key(out_key)

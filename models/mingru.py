@@ -5,6 +5,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
+from arcade_torch.models.arguments import check_flags
 from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan import linear_scan
 
@@ -44,6 +45,7 @@ class MinGRU(Memory):
         slow_gates: bool = False,
     ) -> None:
         super().__init__(input_size, hidden_size)
+        check_flags(slow_gates=slow_gates)
         if candidate not in ("tanh", "linear"):
             raise ValueError(f"candidate must be 'tanh' or 'linear', got {candidate!r}")
         self.candidate = candidate

@@ -11,6 +11,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_sizes, is_whole
 from arcade_torch.models.encoders import Encoder
 from arcade_torch.models.memory import batch_shape, first_state, replay
 from arcade_torch.models.recurrence import Key, Recurrence, Store
@@ -22,6 +23,37 @@ if TYPE_CHECKING:
 __all__ = ["MemoryBlock", "MemoryNetwork"]
 
 SKIPS = ("residual", "none")
+
+
+def check_memory_name(memory: Any) -> None:
+    """Refuse what is neither the name of a memory nor a factory (TypeError)."""
+    is_made = isinstance(memory, nn.Module)
+    if isinstance(memory, str) or (callable(memory) and not is_made):
+        return
+    got = f"the {type(memory).__name__} that is made already" if is_made else repr(memory)
+    raise TypeError(
+        "memory has to be a name, such as 'lru', or a factory that makes one of the width it is "
+        f"asked for, lambda input_size, hidden_size: ..., got {got}"
+    )
+
+
+def _check_steps(features: Tensor, last_action: Any, is_init: Any) -> None:
+    """Refuse last actions and start flags that are not one a step (ValueError): other shapes would
+    be stretched over the batch.
+    """
+    lead = features.shape[:-1]
+    _check_one_a_step("last_action", "whole numbers", last_action, lead)
+    _check_one_a_step("is_init", "bool", is_init, lead)
+
+
+def _check_one_a_step(name: str, kind: str, value: Any, lead: Sequence[int]) -> None:
+    given = type(value).__name__
+    if isinstance(value, Tensor):
+        fits = value.dtype == torch.bool if kind == "bool" else not value.is_floating_point()
+        if fits and list(value.shape) == list(lead):
+            return
+        given = f"{value.dtype} {list(value.shape)}"
+    raise ValueError(f"{name} must be {kind} {list(lead)}, one a step, got {given}")
 
 
 class MemoryBlock(nn.Module):
@@ -42,7 +74,8 @@ class MemoryBlock(nn.Module):
         memory_options: passed on to the cells.
 
     Raises:
-        ValueError: unknown memory or skip, or fewer than one layer.
+        ValueError: unknown memory or skip, fewer than one layer, or a size that is no whole number
+            from 1.
         TypeError: a memory that is neither a name nor a factory.
     """
 
@@ -59,6 +92,11 @@ class MemoryBlock(nn.Module):
         super().__init__()
         if skip not in SKIPS:
             raise ValueError(f"skip must be one of {', '.join(SKIPS)}, got {skip!r}")
+        for name, size in (("input_size", input_size), ("hidden_size", hidden_size)):
+            if not is_whole(size) or size < 1:
+                raise ValueError(f"{name} must be a whole number from 1, got {size!r}")
+        check_sizes(layers=layers)
+        check_memory_name(memory)
         if layers < 1:
             raise ValueError(f"layers must be at least 1, got {layers}")
         options = memory_options or {}
@@ -67,14 +105,6 @@ class MemoryBlock(nn.Module):
         self.residual = skip == "residual"
         self.linear = nn.Linear(input_size, hidden_size)
         make_cell = partial(make_memory, memory) if isinstance(memory, str) else memory
-        if isinstance(memory, nn.Module) or not callable(make_cell):
-            got = repr(memory)
-            if isinstance(memory, nn.Module):
-                got = f"the {type(memory).__name__} that is made already"
-            raise TypeError(
-                "memory has to be a name, such as 'lru', or a factory that makes one of the width "
-                f"it is asked for, lambda input_size, hidden_size: ..., got {got}"
-            )
         self.cells = nn.ModuleList()
         for _ in range(layers):
             self.cells.append(make_cell(hidden_size, hidden_size, **options))
@@ -315,6 +345,10 @@ class MemoryNetwork(TensorDictModuleBase):
         Returns:
             (float [B, T, A], with a value head [B, T, A + 1], state TensorDict [B] after the last
             step).
+
+        Raises:
+            ValueError: last actions or start flags are not one a step, or another shape or type
+                does not fit.
         """
         if self.num_actions:
             features = self._append(features, last_action, is_init)
@@ -392,6 +426,7 @@ class MemoryNetwork(TensorDictModuleBase):
         """Features [..., E] with the one-hot last action [..., E + num_actions]; flags are bool
         [...].
         """
+        _check_steps(features, last_action, is_init)
         one_hot = last_action.unsqueeze(-1) == self.actions
         if self.zero_action_on_reset:
             one_hot = one_hot & ~is_init.unsqueeze(-1)

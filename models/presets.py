@@ -1,7 +1,7 @@
 """Networks by name: presets, and :func:`make_network`."""
 
 import difflib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
@@ -10,8 +10,9 @@ import numpy as np
 import torch
 from torch import nn
 
+from arcade_torch.models.arguments import check_keys, is_whole
 from arcade_torch.models.encoders import Encoder, PaperEncoder, SmallEncoder
-from arcade_torch.models.networks import SKIPS, MemoryBlock, MemoryNetwork
+from arcade_torch.models.networks import SKIPS, MemoryBlock, MemoryNetwork, check_memory_name
 from arcade_torch.models.recurrence import Key, Store
 from arcade_torch.models.stateless import FeedForward
 
@@ -129,7 +130,7 @@ def make_network(
             nn.Module``, or "feedforward": no memory and no last action (704,901 parameters).
         obs_size: side of the frames in pixels.
         num_outputs: A; one per action for Q-values or logits, 1 for a state value.
-        num_actions: number of actions, for the one-hot last action.
+        num_actions: number of actions, for the one-hot last action; 0 for none.
         memory_options: options of the cells, over those of the preset.
         out_key, value_key, state_key, store: see :class:`MemoryNetwork`; a value head is one output
             more. ``store="step"`` goes without ``zero_action_on_reset``.
@@ -150,6 +151,8 @@ def make_network(
         torch.Size([2, 7, 5])
     """
     settings = _settings(preset, options)
+    _check_outputs(num_outputs, num_actions)
+    _check_keys(out_key, value_key, state_key)
     _check_memory_options(memory, memory_options or {})
     if store == "step" and "zero_action_on_reset" not in options:
         settings = replace(settings, zero_action_on_reset=False)
@@ -158,6 +161,24 @@ def make_network(
     parts = _parts(settings, memory, memory_options or {}, obs_size, num_outputs, num_actions)
     names: dict[str, Any] = {"out_key": out_key, "value_key": value_key, "state_key": state_key}
     return MemoryNetwork(**parts, **names, store=store)
+
+
+def _check_outputs(num_outputs: Any, num_actions: Any) -> None:
+    """Refuse numbers of outputs and actions that no network has."""
+    if not is_whole(num_outputs) or num_outputs < 1:
+        raise ValueError(f"num_outputs must be a whole number from 1, got {num_outputs!r}")
+    if not is_whole(num_actions) or num_actions < 0:
+        raise ValueError(f"num_actions must be a whole number from 0, got {num_actions!r}")
+
+
+def _check_keys(out_key: Any, value_key: Any, state_key: Any) -> None:
+    """Refuse keys that TensorDict does not know, and one key for two heads."""
+    keys = {"out_key": out_key, "state_key": state_key}
+    if value_key is not None:
+        keys["value_key"] = value_key
+    check_keys(**keys)
+    if out_key == value_key:
+        raise ValueError(f"out_key and value_key are both {out_key!r}: give each head its own")
 
 
 def _parts(
@@ -169,6 +190,11 @@ def _parts(
     num_actions: int,
 ) -> dict[str, Any]:
     """The parts of a :class:`MemoryNetwork`, by name of its arguments."""
+    if isinstance(settings.encoder, nn.Module) or not callable(settings.encoder):
+        raise ValueError(
+            "encoder must be a function of obs_size that gives an Encoder, such as SmallEncoder, "
+            f"got {settings.encoder!r}"
+        )
     encoder = settings.encoder(obs_size)
     block: FeedForward | MemoryBlock
     if memory == FEED_FORWARD:
@@ -247,6 +273,11 @@ def _check_memory_options(
     memory: str | Callable[..., nn.Module], memory_options: dict[str, Any]
 ) -> None:
     """Refuse options of a memory that is not there, and numbers that no machine could hold."""
+    check_memory_name(memory)
+    if not isinstance(memory_options, Mapping):
+        raise ValueError(
+            f"memory_options must be a mapping of names to values, got {memory_options!r}"
+        )
     if memory == FEED_FORWARD and memory_options:
         raise TypeError(
             f"{FEED_FORWARD!r} has no memory, so memory_options must be left out, got "

@@ -34,7 +34,7 @@ class RTU(Memory):
         max_phase: initial theta are uniform in [0, max_phase] radians.
 
     Raises:
-        ValueError: sizes or radii out of range.
+        ValueError: sizes, radii or phase out of range.
 
     Source: Elelimy et al. (2024), arXiv 2409.01449, section 3.
     """

@@ -8,6 +8,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_sizes
 from arcade_torch.models.fast_weights import unit_length
 from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan_dplr import dplr_loop, dplr_scan
@@ -48,6 +49,7 @@ class RWKV7(Memory):
     def __init__(self, input_size: int, hidden_size: int, *, key_size: int | None = None) -> None:
         super().__init__(input_size, hidden_size)
         size = max(1, round(math.sqrt(hidden_size))) if key_size is None else key_size
+        check_sizes(key_size=size)
         if size < 1:
             raise ValueError(f"key_size must be positive, got {key_size}")
         self.key_size = size

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_numbers, check_sizes
 from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan import linear_scan
 
@@ -52,6 +53,8 @@ class S5(Memory):
     ) -> None:
         super().__init__(input_size, hidden_size)
         size = hidden_size + hidden_size % 2 if state_size is None else state_size
+        check_sizes(state_size=size)
+        check_numbers(dt_min=dt_min, dt_max=dt_max)
         if size < 2 or size % 2:
             raise ValueError(f"state_size must be even (conjugate pairs) and positive, got {size}")
         if not 0 < dt_min <= dt_max:

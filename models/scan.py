@@ -35,9 +35,9 @@ def linear_scan(
     through ``torch.library``; use ``torch.autograd.grad``.
 
     Args:
-        a: float or complex, broadcastable to ``[B, T, ...]``: the factors (a constant ``[...]`` is
-            fine).
-        b: float or complex ``[B, T, ...]``: the inputs.
+        a: float, complex or int, broadcastable to ``[B, T, ...]``: the factors (a constant
+            ``[...]`` is fine).
+        b: float, complex or int ``[B, T, ...]``: the inputs.
         start: bool ``[B, T]`` or None; True where an episode begins: ``h_{t-1}`` is not looked at
             there, be it NaN.
         h0: the state before index 0, ``[B, ...]`` (one dimension less than ``b``; dropped where
@@ -49,7 +49,8 @@ def linear_scan(
         ``[B, T, ...]``, every state, in the common dtype of ``a`` and ``b``.
 
     Raises:
-        ValueError: shapes do not fit, or ``start`` is not bool ``[B, T]``.
+        ValueError: shapes do not fit, ``start`` is not bool ``[B, T]``, ``a`` and ``b`` are bool,
+            ``h0`` is complex where they are not, or one of them is no tensor.
 
     Source: Blelloch (1990), "Prefix sums and their applications", section 1.4; resets as in arXiv
         2303.03982.
@@ -61,6 +62,7 @@ def linear_scan(
         >>> linear_scan(a, b, start=torch.tensor([[False, False, True, False]])).flatten().tolist()
         [1.0, 1.5, 1.0, 1.5]
     """
+    _check_tensors(a, b, start, h0)
     if a.dtype != b.dtype:
         dtype = torch.promote_types(a.dtype, b.dtype)
         a = a.to(dtype)
@@ -72,10 +74,27 @@ def linear_scan(
         b, start = _load_stored_states(a, b, start, h0)
         h0 = None
     if b.shape[1] == 1:  # acting: no operator, no loop
-        return b if h0 is None else torch.addcmul(b, a, _keep(h0, start).unsqueeze(1))
+        return b.clone() if h0 is None else torch.addcmul(b, a, _keep(h0, start).unsqueeze(1))
     if h0 is None:
         h0 = b.new_zeros(b.shape[:1] + b.shape[2:])
     return scan(a.expand(b.shape), b, start, h0)  # type: ignore[no-any-return]
+
+
+def _check_tensors(a: Any, b: Any, start: Any, h0: Any) -> None:
+    """Raise ValueError unless the types are those that :func:`linear_scan` documents."""
+    for name, value in (("a", a), ("b", b)):
+        if not isinstance(value, Tensor):
+            raise ValueError(f"{name} must be a tensor, got a {type(value).__name__}")
+    for name, value in (("start", start), ("h0", h0)):
+        if value is not None and not isinstance(value, Tensor):
+            raise ValueError(f"{name} must be a tensor or None, got a {type(value).__name__}")
+    is_complex = a.is_complex() or b.is_complex()
+    if a.dtype == torch.bool and b.dtype == torch.bool:
+        raise ValueError("a and b must be floats, complex or whole numbers, got torch.bool")
+    if h0 is not None and h0.is_complex() and not is_complex:
+        raise ValueError(
+            f"h0 is complex, and a and b are not ({a.dtype} and {b.dtype}): cast one of them"
+        )
 
 
 def _check(a: Tensor, b: Tensor, start: Tensor | None, h0: Tensor | None) -> None:

@@ -17,12 +17,13 @@ Source: Yang et al. (2024), arXiv 2406.06484, section 3.2; with decay: Yang et a
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import is_whole
 from arcade_torch.models.scan import linear_scan
 
 __all__ = ["MatrixSteps", "matrix_scan", "matrix_scan_loop", "matrix_scan_stored"]
@@ -62,7 +63,14 @@ def matrix_scan(
 
     Returns:
         (o [B, T, V], the last state [B, K, V]).
+
+    Raises:
+        ValueError: shapes or dtypes do not fit, ``start`` is not bool [B, T], or ``chunk`` is no
+            whole number from 1.
     """
+    check_steps(steps, start, h0)
+    if not is_whole(chunk) or chunk < 1:
+        raise ValueError(f"chunk must be a whole number from 1, got {chunk!r}")
     if steps.query.shape[1] == 1:  # acting
         state = torch.where(start[:, 0, None, None], 0, h0)
         out, state = _step([None if x is None else x[:, 0] for x in steps], state)
@@ -87,7 +95,15 @@ def matrix_scan_loop(
 
     Returns:
         (o [B, T, V], the state after each step [B, T, K, V]).
+
+    Raises:
+        ValueError: shapes or dtypes do not fit, ``start`` is not bool [B, T], or ``erase_values``
+            with K other than V.
     """
+    check_steps(steps, start, h0, takes_stored=True)
+    if erase_values and steps.key.shape[-1] != steps.value.shape[-1]:
+        sizes = f"{steps.key.shape[-1]} and {steps.value.shape[-1]}"
+        raise ValueError(f"erase_values needs K = V, got {sizes}")
     stored = h0.ndim == steps.query.ndim + 1
     state = h0[:, 0] if stored else h0
     outputs = []
@@ -101,6 +117,41 @@ def matrix_scan_loop(
         outputs.append(out)
         states.append(state)
     return torch.stack(outputs, dim=1), torch.stack(states, dim=1)
+
+
+def check_steps(steps: MatrixSteps, start: Any, h0: Any, *, takes_stored: bool = False) -> None:
+    """Raise ValueError unless shapes and dtypes are those that :func:`matrix_scan` documents.
+
+    Args:
+        steps: what each step does.
+        start: bool [B, T].
+        h0: [B, K, V].
+        takes_stored: whether it may be [B, T, K, V] too.
+    """
+    query, _, value = steps[:3]
+    if query.ndim != 3 or value.ndim != 3 or query.shape[1] == 0:
+        raise ValueError(
+            "query must be [B, T, K] and value [B, T, V] with at least one step, got "
+            f"{list(query.shape)} and {list(value.shape)}"
+        )
+    lead = list(query.shape[:2])
+    size = query.shape[-1]
+    widths = {"query": size, "key": size, "value": value.shape[-1], "erase": 1, "log_decay": 1}
+    for name, x in steps._asdict().items():
+        if x is not None and list(x.shape) != [*lead, widths[name]]:
+            raise ValueError(f"{name} must be {[*lead, widths[name]]}, got {list(x.shape)}")
+        if x is not None and x.dtype != query.dtype:
+            raise ValueError(f"{name} is {x.dtype}, and query {query.dtype}: cast one of them")
+    if not isinstance(start, Tensor) or start.dtype != torch.bool or list(start.shape) != lead:
+        got = f"{start.dtype} {list(start.shape)}" if isinstance(start, Tensor) else repr(start)
+        raise ValueError(f"start must be bool {lead}, got {got}; [B, T, 1] needs squeeze(-1)")
+    matrix = [size, value.shape[-1]]
+    allowed = [[lead[0], *matrix], [*lead, *matrix]] if takes_stored else [[lead[0], *matrix]]
+    if not isinstance(h0, Tensor) or list(h0.shape) not in allowed:
+        got = str(list(h0.shape)) if isinstance(h0, Tensor) else repr(h0)
+        raise ValueError(f"h0 must be {' or '.join(map(str, allowed))}, got {got}")
+    if h0.dtype != query.dtype:
+        raise ValueError(f"h0 is {h0.dtype}, and query {query.dtype}: cast one of them")
 
 
 def matrix_scan_stored(steps: MatrixSteps, start: Tensor, stored: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,6 +7,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from arcade_torch.models.arguments import check_sizes
 from arcade_torch.models.memory import Memory
 from arcade_torch.models.scan import linear_scan
 
@@ -48,6 +49,7 @@ class StableHadamardMemory(Memory):
     ) -> None:
         super().__init__(input_size, hidden_size)
         self.key_size = max(1, round(math.sqrt(hidden_size))) if key_size is None else key_size
+        check_sizes(key_size=self.key_size, rows=rows)
         if self.key_size < 1 or rows < 1:
             raise ValueError(f"key_size and rows must be positive, got {key_size} and {rows}")
         self.state_shape = (self.key_size, self.key_size)

@@ -34,6 +34,7 @@ from torch import Tensor, nn
 from arcade_torch.agents.forward import evaluating, state_of, state_of_rows
 from arcade_torch.models.actor_critic import ActorCriticNetwork
 from arcade_torch.models.networks import MemoryNetwork
+from arcade_torch.tools.measures.arguments import check_white
 from arcade_torch.tools.measures.frames import float_type, floats_are_taken
 from arcade_torch.tools.measures.keys import Channels, Keys, Names, refuse_unknown
 from arcade_torch.tools.measures.masked import are_near, refuse_nan
@@ -298,9 +299,11 @@ def as_policy(model: Any, **names: Unpack[Names]) -> Policy:
 
     Raises:
         TypeError: ``model`` has none of these forms, or there is no such keyword.
-        ValueError: a TensorDict policy reads or writes entries that say nothing to a measure.
+        ValueError: a TensorDict policy reads or writes entries that say nothing to a measure, or
+            ``white`` is no number above 0.
     """
     refuse_unknown(names)
+    check_white(names.get("white"))
     model = getattr(model, "_orig_mod", model)  # of torch.compile
     network = getattr(model, "network", model)
     if isinstance(model, Policy):

@@ -18,6 +18,7 @@ from arcade_torch.agents.config import SEED_LIMIT
 from arcade_torch.envs_jax.registry import is_mixture
 from arcade_torch.envs_jax.validation import format_value
 from arcade_torch.tools.imports import load_agent
+from arcade_torch.tools.measures.arguments import check_played, check_twin
 from arcade_torch.tools.measures.choices import check_choices
 from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
 from arcade_torch.tools.measures.keys import Keys, Names
@@ -99,6 +100,7 @@ def greedy_window(
     Raises:
         ValueError: the env is not a batch of one, or ``max_steps`` is below 1.
     """
+    check_played(seed, observability, max_steps=(max_steps, 1))
     seed = held_out(seed) if env is None else seed
     is_users = env is not None
     # as many envs of its own as other measures play: what is compiled for those serves here too
@@ -109,9 +111,16 @@ def greedy_window(
         list(env.batch_size),
         "[] or [1], for one episode",
     )
-    require(max_steps >= 1, "max_steps", max_steps, "at least 1")
     (window,), _ = play(player, env, seed=seed, keep=max_steps, max_steps=max_steps, most=1)
     return window
+
+
+def check_episodes(
+    episodes: Any, seed: Any, end: Any = "last", cap: Any = MAX_STEPS, twin: Any = None
+) -> None:
+    """Refuse what `greedy_windows` could not play, and an unknown twin (ValueError)."""
+    require(end in get_args(End), "end", end, f"one of {', '.join(get_args(End))}")
+    check_played(seed, twin, episodes=(episodes, 1), cap=(cap, MIN_STEPS))
 
 
 def greedy_windows(
@@ -137,9 +146,7 @@ def greedy_windows(
         ValueError: a number is below 1, ``end`` is unknown, or the agent chooses other actions than
             the best of its outputs, by which decisions are compared.
     """
-    require(end in get_args(End), "end", end, f"one of {', '.join(get_args(End))}")
-    require(episodes >= 1, "episodes", episodes, "at least 1")
-    require(cap >= MIN_STEPS, "cap", cap, f"at least {MIN_STEPS}")
+    check_episodes(episodes, seed, end, cap)
     size = EpisodeBatch(env, keys_of(agent)).size
     for group in range(-(-episodes // size)):
         rng = np.random.default_rng([seed, group])
@@ -285,6 +292,7 @@ def resolve_agent(
         )
     if isinstance(agent, str | Path):
         agent = load_agent(Path(agent))
+    check_twin(observability)
     acts = hasattr(agent, "act") and hasattr(agent, "initial_state")
     player = agent if acts and not names else as_policy(agent, **names)
     if env is not None:

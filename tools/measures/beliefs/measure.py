@@ -28,7 +28,8 @@ from typing import Any, Literal, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from arcade_torch.agents.checked import require
+from arcade_torch.agents.checked import require, whole_number
+from arcade_torch.tools.measures.arguments import check_played
 from arcade_torch.tools.measures.beliefs.recording import (
     CLASSES,
     MIN_EPISODES,
@@ -158,6 +159,8 @@ def beliefs(
     Raises:
         ValueError: an option is out of range, the env names no facts, or all of them are constant.
     """
+    counts = {"episodes": (episodes, MIN_EPISODES), "max_steps": (max_steps, 1)}
+    check_played(seed, observability, **counts)
     player, env = resolve_agent(agent, env, observability, **names)
     recording = record(
         player, env, episodes=episodes, max_steps=max_steps, seed=seed, progress=progress
@@ -175,6 +178,7 @@ def beliefs_of(recording: Recording, seed: int = 0) -> Beliefs:
     Raises:
         ValueError: too few episodes, or no fact that varies.
     """
+    whole_number("seed", seed, 0)
     episodes = len(recording.lengths)
     require(episodes >= MIN_EPISODES, "episodes", episodes, f"at least {MIN_EPISODES}")
     split = Split.of(recording.lengths, recording.states.shape[1], seed)

@@ -17,6 +17,7 @@ from tensordict import TensorDictBase
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT
+from arcade_torch.tools.measures.arguments import check_played
 from arcade_torch.tools.measures.beliefs.recording import check_seen, first_row
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
 from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
@@ -110,8 +111,8 @@ def patching(
     Raises:
         ValueError: an option is out of range, or the env holds a single episode.
     """
-    require(episodes >= MIN_EPISODES, "episodes", episodes, f"at least {MIN_EPISODES}")
-    require(max_steps >= 1, "max_steps", max_steps, "at least 1")
+    counts = {"episodes": (episodes, MIN_EPISODES), "max_steps": (max_steps, 1)}
+    check_played(seed, observability, **counts)
     player, env = resolve_agent(agent, env, observability, **names)
     played = EpisodeBatch(env, keys_of(player))
     size = played.size

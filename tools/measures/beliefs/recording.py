@@ -12,6 +12,7 @@ from torch import Tensor
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT
+from arcade_torch.tools.measures.arguments import check_played
 from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
 from arcade_torch.tools.measures.policy import FEW, Progress, policy_of
 from arcade_torch.tools.measures.windows import held_out, keys_of
@@ -72,8 +73,8 @@ def record(
 
     Everything is as for `arcade_torch.tools.beliefs`.
     """
-    require(episodes >= MIN_EPISODES, "episodes", episodes, f"at least {MIN_EPISODES}")
-    require(max_steps >= 1, "max_steps", max_steps, "at least 1")
+    counts = {"episodes": (episodes, MIN_EPISODES), "max_steps": (max_steps, 1)}
+    check_played(seed, **counts)
     if not hasattr(env, "facts"):
         raise ValueError(
             f"{type(env).__name__} has no facts(): hand over an ArcadeEnv, or an env whose facts() "

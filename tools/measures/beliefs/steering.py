@@ -19,10 +19,12 @@ from numpy.typing import NDArray
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT
+from arcade_torch.tools.measures.arguments import check_played
 from arcade_torch.tools.measures.beliefs.measure import Targets
 from arcade_torch.tools.measures.beliefs.patching import NOBODY, Patches, draw_donors
 from arcade_torch.tools.measures.beliefs.recording import (
     CLASSES,
+    MIN_EPISODES,
     Floats,
     Ints,
     Recording,
@@ -111,6 +113,8 @@ def steering(
     Raises:
         ValueError: an option is out of range, or the env names no facts or holds a single episode.
     """
+    counts = {"episodes": (episodes, MIN_EPISODES), "max_steps": (max_steps, 1)}
+    check_played(seed, observability, **counts)
     player, env = resolve_agent(agent, env, observability, **names)
     played = EpisodeBatch(env, keys_of(player))
     size = played.size

@@ -24,7 +24,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arcade_torch.agents.checked import require
+from arcade_torch.tools.measures import arguments
 from arcade_torch.tools.measures.bootstrap import Array
 from arcade_torch.tools.measures.envs import one_hot
 from arcade_torch.tools.measures.frames import float_type, pictures, white_of
@@ -46,6 +46,7 @@ from arcade_torch.tools.measures.policy import (
 )
 from arcade_torch.tools.measures.windows import (
     MAX_STEPS,
+    MIN_STEPS,
     Twin,
     Window,
     greedy_windows,
@@ -130,10 +131,10 @@ def contamination(
     Raises:
         ValueError: an option is out of range, or no episode was long enough.
     """
-    require(min(sigmas, default=-1) >= 0, "sigmas", list(sigmas), "numbers of at least 0")
-    whole = len(delays) > 0 and all(int(delay) == delay >= 0 for delay in delays)
-    require(whole, "delays", list(delays), "whole numbers of at least 0")
-    require(starts >= 1, "starts", starts, "at least 1")
+    arguments.check_strengths("sigmas", sigmas)
+    arguments.check_whole("delays", delays)
+    arguments.check_flags(clip=clip, feedback=feedback, shuffle=shuffle)
+    arguments.check_played(seed, observability, starts=(starts, 1), cap=(cap, MIN_STEPS))
     player, env = resolve_agent(agent, env, observability, **names)
     disturbance = Shuffle() if shuffle else Noise(np.array(sigmas, np.float64), clip)
     steps = np.unique(np.array(delays, np.int64))
@@ -363,7 +364,9 @@ def contamination_example(
     the decision, a row each. Everything else is as for `contamination`; a ``ValueError`` if
     ``horizon`` is below 2, or no episode was long enough.
     """
-    require(horizon >= 2, "horizon", horizon, "at least 2")
+    arguments.check_strengths("sigma", [sigma])
+    arguments.check_flags(clip=clip, feedback=feedback, shuffle=shuffle)
+    arguments.check_played(seed, observability, horizon=(horizon, 2))
     player, env = resolve_agent(agent, env, observability, **names)
     policy = as_policy(player)
     output = resolve(player, target)

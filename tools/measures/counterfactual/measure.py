@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arcade_torch.agents.checked import require
+from arcade_torch.tools.measures.arguments import check_played
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
 from arcade_torch.tools.measures.contamination.measure import output_of_actions
 from arcade_torch.tools.measures.frames import as_array
@@ -38,6 +38,7 @@ from arcade_torch.tools.measures.windows import (
     End,
     Twin,
     Window,
+    check_episodes,
     greedy_windows,
     resolve_agent,
 )
@@ -165,6 +166,8 @@ def counterfactual(
         ValueError: an option is out of range, this agent does not offer ``target``, or no two
             episodes have a step in common.
     """
+    check_episodes(episodes, seed, end, cap, observability)
+    check_played(seed, donors=(donors, 1), block=(block, 1), most_lags=(most_lags, 1))
     player, env = resolve_agent(agent, env, observability, **names)
     windows = greedy_windows(player, env, episodes=episodes, seed=seed, end=end, cap=cap)
     tell = None if progress is None else lambda count: progress(count, episodes)
@@ -199,9 +202,7 @@ def counterfactual_of_windows(
     ``progress`` is called with the number of decisions done. Everything else is as for
     `counterfactual`.
     """
-    require(donors >= 1, "donors", donors, "at least 1")
-    require(block >= 1, "block", block, "at least 1")
-    require(most_lags >= 1, "most_lags", most_lags, "at least 1")
+    check_played(seed, donors=(donors, 1), block=(block, 1), most_lags=(most_lags, 1))
     policy = as_policy(model, **names)
     exchange = Exchange(policy, output_of_actions(policy, target), donors, block, most_lags)
     with exchange.policy.evaluating():

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from arcade_torch.agents.checked import require
+from arcade_torch.agents.checked import coerce, require, whole_number
 from arcade_torch.envs_jax.registry import DIFFICULTIES, is_mixture
 from arcade_torch.tools.measures import bootstrap
 from arcade_torch.tools.measures.bootstrap import Array, Interval, percentile_interval
@@ -203,8 +203,10 @@ def gap_and_bias(
         ValueError: no agent is complete on any task, the baseline is missing, or an argument is out
             of range.
     """
+    confidence = coerce("confidence", confidence, float)
     require(0 < confidence < 1, "confidence", confidence, "between 0 and 1")
-    require(draws >= 1, "draws", draws, "at least 1")
+    draws = whole_number("draws", draws, 1)
+    seed = whole_number("seed", seed, 0)
     cells = _cells(read_scores(runs, metric))
     baselines = _baselines(cells, baseline)
     games = list(dict.fromkeys(game for _, game, _ in cells))

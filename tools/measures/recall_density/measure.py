@@ -20,13 +20,14 @@ from numpy.typing import NDArray
 from arcade_torch.tools.measures.bootstrap import Array
 from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.policy import Progress, Target, as_policy, resolve
-from arcade_torch.tools.measures.saliency.measure import Norm, Reduce, saliency
+from arcade_torch.tools.measures.saliency.measure import Norm, Reduce, check_norm, saliency
 from arcade_torch.tools.measures.windows import (
     MAX_STEPS,
     MIN_STEPS,
     End,
     Twin,
     Window,
+    check_episodes,
     greedy_windows,
     resolve_agent,
 )
@@ -116,6 +117,8 @@ def recall_density(
     Raises:
         ValueError: an option is out of range, or this agent does not offer ``target``.
     """
+    check_episodes(episodes, seed, end, cap, observability)
+    check_norm(reduce, norm)
     player, env = resolve_agent(agent, env, observability, **names)
     windows = greedy_windows(player, env, episodes=episodes, seed=seed, end=end, cap=cap)
     tell = None if progress is None else lambda count: progress(count, episodes)

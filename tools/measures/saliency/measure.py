@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from arcade_torch.agents.checked import require
+from arcade_torch.agents.checked import require, whole_number
+from arcade_torch.models.arguments import is_whole
 from arcade_torch.tools.measures.frames import as_array, channel_axis, float_type
 from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.masked import refuse_nan, refuse_no_action
@@ -102,8 +103,8 @@ def saliency(
     """
     policy = as_policy(model, **names)
     frames = torch.as_tensor(frames)
+    _check_options(reduce, norm, chunk, resolve(policy, target), dtype)
     dtype = dtype or float_type(frames)
-    _check_options(reduce, norm, chunk, resolve(policy, target))
     steps = _index(n, frames) + 1
     # what is computed in inference mode has no gradient, in silence
     with torch.inference_mode(False), torch.enable_grad(), policy.evaluating():
@@ -126,21 +127,29 @@ def saliency(
     )
 
 
-def _check_options(reduce: str, norm: str, chunk: int, target: str) -> None:
+def _check_options(reduce: str, norm: str, chunk: int, target: str, dtype: Any) -> None:
     """Refuse options of `saliency` that are unknown, out of range, or do not go together."""
     if (reduce, target) == ("sum", "probs"):
         raise ValueError(
             "the sum of all probabilities is always 1: take reduce per_action, or target logits"
         )
+    check_norm(reduce, norm)
+    whole_number("chunk", chunk, 1)
+    is_float = isinstance(dtype, torch.dtype) and dtype.is_floating_point
+    require(dtype is None or is_float, "dtype", dtype, "a floating one of torch")
+
+
+def check_norm(reduce: str, norm: str) -> None:
+    """Refuse an unknown norm, or way to put the actions together (ValueError)."""
     require(reduce in get_args(Reduce), "reduce", reduce, f"one of {', '.join(get_args(Reduce))}")
     require(norm in get_args(Norm), "norm", norm, f"one of {', '.join(get_args(Norm))}")
-    require(chunk >= 1, "chunk", chunk, "at least 1")
 
 
 def _index(n: int, frames: Tensor) -> int:
     """The index of a frame, counted from the first; negative ``n`` count from the end."""
     require(frames.ndim > 1, "the shape of frames", list(frames.shape), "[T, H, W, C] or the like")
     total = frames.shape[0]
+    require(is_whole(n), "n", n, "a whole number")
     require(-total <= n < total, "n", n, f"inside a window of {total} frames")
     return n % total
 
