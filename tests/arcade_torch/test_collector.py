@@ -539,6 +539,24 @@ def test_a_change_of_observability_between_windows_is_seen_at_once() -> None:
     ).all()  # the stub's partial frames hide the serial number
 
 
+def test_final_frames_show_the_twin_that_each_step_showed() -> None:
+    """Before: all of a window showed the twin of its last end, so partial ones the whole state."""
+
+    def turning(env: ArcadeEnv) -> Callable[[TensorDictBase], TensorDictBase]:
+        twins = itertools.cycle(["full"] * 4 + ["partial"] * 4)
+
+        def policy(td: TensorDictBase) -> TensorDictBase:
+            env.set_observability(next(twins))
+            return scripted(td)
+
+        return policy
+
+    env, twin = stub_env(HASTY), stub_env(HASTY)
+    rollout = twin.rollout(3 * T, turning(twin), break_when_any_done=False)
+    batches = ArcadeCollector(env, turning(env), N * T, 3 * N * T)
+    assert_same(torch.cat(list(batches), 1).exclude("collector"), rollout)
+
+
 def rollout_of(env: ArcadeEnv) -> None:
     assert env.rollout(100)["next", "done"][
         :, -1
@@ -745,6 +763,20 @@ def test_an_overlap_without_the_next_frames_that_batches_show_is_refused(mode: A
     collector.collect()
     with pytest.raises(ValueError, match="saved overlap 'dense/pixels' is None"):
         stub_collector(scripted, overlap=2).load_state_dict(collector.state_dict())
+
+
+def test_after_a_state_that_was_refused_windows_are_whole() -> None:
+    """Before: the overlap was half that of the refused state, which no memory had acted."""
+    saved = stub_collector(Recurrent(), overlap=3, final_frames="truncated")
+    saved.collect()
+    collector = stub_collector(Recurrent(), seed=77, overlap=3)
+    collector.collect()
+    with pytest.raises(ValueError, match="saved overlap"):
+        collector.load_state_dict(saved.state_dict())
+    for _ in range(2):
+        batch = collector.collect()
+        assert torch.equal(replay(batch), batch["total"])
+        assert torch.equal(batch["is_init"][:, 1:], batch["next", "done"][:, :-1])
 
 
 def test_a_state_of_other_sizes_is_refused() -> None:
