@@ -779,6 +779,26 @@ def test_after_a_state_that_was_refused_windows_are_whole() -> None:
         assert torch.equal(batch["is_init"][:, 1:], batch["next", "done"][:, :-1])
 
 
+def test_weights_that_a_state_lacks_are_refused_unless_they_may() -> None:
+    head = nn.Sequential(nn.Linear(3, 5), nn.Flatten(0, -2))
+    policy = TensorDictSequential(
+        TensorDictModule(lambda frames: frames[:, 0, 0].float(), ["pixels"], ["x"]),
+        TensorDictModule(head, ["x"], ["q"]),
+        TensorDictModule(lambda q: q.argmax(-1), ["q"], ["action"]),
+    )
+    collector = stub_collector(policy)
+    state = collector.state_dict()
+    weights = dict(state["policy_state_dict"])
+    name = next(iter(weights))
+    state["policy_state_dict"] = {key: value for key, value in weights.items() if key != name}
+    with pytest.raises(RuntimeError, match=re.escape(name)):
+        collector.load_state_dict(state)
+    collector.load_state_dict(state, strict=False)
+    del state["policy_state_dict"]
+    collector.load_state_dict(state, strict=False)
+    collector.collect()
+
+
 def test_a_state_of_other_sizes_is_refused() -> None:
     state = stub_collector(scripted).state_dict()
     with pytest.raises(
