@@ -442,6 +442,22 @@ def test_dqn_waits_for_its_replay_and_then_learns_from_it(targets, waits, tmp_pa
     assert ("stored_target" in drawn) == (targets == "stored")
 
 
+def test_dqn_learns_from_batch_sequences_of_old_and_new_windows(monkeypatch):
+    numbers = UPDATE | UPDATE_OF["dqn"] | {"replay_frames": 48}
+    training = Training(96, torch.Generator().manual_seed(3), torch.device("cpu"))
+    learner = LEARNERS["dqn"](toy_network(3), GROUPS["dqn"](**numbers), training)
+    read, prepare = [], learner.loss.prepare
+    monkeypatch.setattr(
+        learner.loss, "prepare", lambda batch: (read.append(batch), prepare(batch))[1]
+    )
+    batch = stream(4, 6, seed=6).sequences()
+    for window in range(2):
+        batch["next", "reward"] = torch.full((4, 6, 1), float(window))
+        learner.update(batch, 24 * window)
+    assert len(read[1]) == 4
+    assert set(read[1]["next", "reward"].unique().tolist()) == {0.0, 1.0}
+
+
 def test_stored_targets_are_those_of_the_network_that_collected_them():
     trainer = Trainer(
         config(
