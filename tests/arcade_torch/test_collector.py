@@ -845,6 +845,13 @@ def test_weights_that_a_state_lacks_are_refused_unless_they_may() -> None:
     collector.collect()
 
 
+def test_a_recurrent_state_of_another_policy_is_refused() -> None:
+    collector = stub_collector(Recurrent())
+    collector.collect()
+    with pytest.raises(ValueError, match="the saved recurrent state is not one of this policy"):
+        stub_collector(None).load_state_dict(collector.state_dict())
+
+
 def test_a_state_of_other_sizes_is_refused() -> None:
     state = stub_collector(scripted).state_dict()
     with pytest.raises(
