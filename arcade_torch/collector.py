@@ -415,6 +415,7 @@ class ArcadeCollector(BaseCollector):
         out["traj_ids"] = self._traj_ids.clone()
         out["next_traj_id"] = self._next_traj_id
         out["numbered"] = self._numbered
+        out["begun"] = self._obs is not None
         if self._obs is None or self._buffer is None:
             return out
         out["recurrent_state"] = self._state.clone().to_dict()
@@ -462,23 +463,35 @@ class ArcadeCollector(BaseCollector):
             self._next_traj_id = int(state_dict["next_traj_id"])
         self._numbered = int(state_dict.get("numbered", self._iter))
         if "recurrent_state" not in state_dict:
+            # of a window that was lost: _look begins anew where the env is
+            self._obs = {} if state_dict.get("begun", False) else None
             return
-        self._acted = int(state_dict["acted"])
+        self._load_windows(state_dict)
+
+    def _load_windows(self, state_dict: dict[str, Any]) -> None:
+        """Load what the coming windows go on with: observation, overlap, recurrent states."""
         initial = self._runner.initial_state()
-        self._state = self._as_state(state_dict["recurrent_state"], initial)
-        starts = [self._as_state(state, initial) for state in state_dict["window_starts"]]
-        if self._acted and len(starts) != -(-self._overlap // self._steps):
+        state = self._as_state(state_dict["recurrent_state"], initial)
+        starts = [self._as_state(start, initial) for start in state_dict["window_starts"]]
+        acted = int(state_dict["acted"])
+        if acted and len(starts) != -(-self._overlap // self._steps):
             raise ValueError(
                 f"the saved collector has {len(starts)} states before its coming windows"
             )
-        self._window_starts.extend(starts)
         # somebody may still hold batches of the old storage
         self._obs = {}
         self._buffer = None
         # where others had moved the env, _look begins anew
-        if not state_dict.get("moved", self._acted == 0):
+        moved = state_dict.get("moved", acted == 0)
+        if not moved:
             self._observe(self.env.observe())
         self._look()[0].load_overlap_state(state_dict["overlap"])
+        if moved:
+            return
+        # last, for an overlap that was refused is none to go on with
+        self._acted = acted
+        self._state = state
+        self._window_starts.extend(starts)
 
     def _as_state(self, state: dict[str, Any], initial: TensorDict) -> TensorDict:
         """A saved recurrent state; a ValueError if its entries are not those of the policy."""

@@ -191,17 +191,17 @@ def _bits(values: jax.Array) -> jax.Array:
 def _draw_rows(
     group: BatchedGame[Any],
     states: list[Any],
-    flags: jax.Array,
+    flags: list[jax.Array],
     index: jax.Array,
     first: int,
     spare: Spare,
 ) -> jax.Array:
     """Draw n envs, each after some step: ``index`` [2, n] is step and env; the states begin with
-    the env ``first``.
+    the env ``first``, the flags of partial views with the env 0.
     """
     step, row = index
     picked = jax.tree.map(lambda *leaves: jnp.stack(leaves)[step, row - first], *states)
-    return jax.vmap(group.game.render)(picked, flags[row])
+    return jax.vmap(group.game.render)(picked, jnp.stack(flags)[step, row])
 
 
 def compiled_game(

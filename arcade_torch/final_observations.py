@@ -37,7 +37,7 @@ class FinalObservations:
             self._games.append(_OneGame(draw_rows, rows, steps, obs_size, device))
         self._split_states = batched.states
         self._states: dict[int, tuple[Any, ...]] = {}
-        self._partial: jax.Array | None = None
+        self._partial: dict[int, jax.Array] = {}  # a policy may change the twin in mid-window
 
     def add(self, index: int, final: tuple[Any, jax.Array]) -> None:
         """Keep the state that a step led to, before the resets, under a number; and who saw the
@@ -45,7 +45,7 @@ class FinalObservations:
         """
         final_state, partial = final
         self._states[index] = self._split_states(final_state)
-        self._partial = partial
+        self._partial[index] = partial
 
     def draw(
         self, wanted: np.ndarray
@@ -68,10 +68,12 @@ class FinalObservations:
             for some_rows, some_steps in game.portions(rows[plays_it], steps[plays_it]):
                 indices = np.unique(some_steps)
                 states = [self._states[index][number] for index in indices.tolist()]
+                flags = [self._partial[index] for index in indices.tolist()]
                 place = np.searchsorted(indices, some_steps)
-                frames = game.draw(states, self._partial, place, some_rows)
+                frames = game.draw(states, flags, place, some_rows)
                 portions.append((some_rows, some_steps, {"pixels": frames}, slice(len(some_rows))))
         self._states.clear()
+        self._partial.clear()
         return portions
 
 
@@ -104,12 +106,14 @@ class _OneGame:
             steps = steps[count:]
 
     def draw(
-        self, states: list[Any], flags: Any, step: np.ndarray, row: np.ndarray
+        self, states: list[Any], flags: list[jax.Array], step: np.ndarray, row: np.ndarray
     ) -> jax.Array | np.ndarray:
-        """One call; ``step`` counts in ``states``. What is short of the compiled shape is filled
-        up.
+        """One call; ``step`` counts in ``states`` and ``flags``. What is short of the compiled
+        shape is filled up.
         """
-        states = states + [states[-1]] * (self._max_steps - len(states))
+        missing = self._max_steps - len(states)
+        states = states + [states[-1]] * missing
+        flags = flags + [flags[-1]] * missing
         index = np.empty((2, self._size), np.int32)
         index[:, : len(row)] = (step, row)
         index[:, len(row) :] = ((step[-1],), (row[-1],))

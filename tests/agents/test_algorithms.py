@@ -411,9 +411,16 @@ def test_a_mixed_batch_holds_half_of_each_twin(algorithm):
     trainer.update()
 
 
-@pytest.mark.parametrize("targets", ["recompute", "stored"])
-def test_dqn_waits_for_its_replay_and_then_learns_from_it(targets, tmp_path):
-    numbers = {"overlap": 2, "learning_starts": 8, "target_every": 0, "targets": targets}
+@pytest.mark.parametrize(
+    ("targets", "waits"),
+    [
+        ("recompute", {"learning_starts": 8}),
+        ("recompute", {"batch_sequences": 8}),
+        ("stored", {"learning_starts": 8}),
+    ],
+)
+def test_dqn_waits_for_its_replay_and_then_learns_from_it(targets, waits, tmp_path):
+    numbers = {"overlap": 2, "target_every": 0, "targets": targets} | waits
     trainer = Trainer(config("dqn", dqn=numbers), tmp_path)
     first, second = trainer.update(), trainer.update()
     assert (
@@ -435,6 +442,22 @@ def test_dqn_waits_for_its_replay_and_then_learns_from_it(targets, tmp_path):
     assert ("stored_target" in drawn) == (targets == "stored")
 
 
+def test_dqn_learns_from_batch_sequences_of_old_and_new_windows(monkeypatch):
+    numbers = UPDATE | UPDATE_OF["dqn"] | {"replay_frames": 48}
+    training = Training(96, torch.Generator().manual_seed(3), torch.device("cpu"))
+    learner = LEARNERS["dqn"](toy_network(3), GROUPS["dqn"](**numbers), training)
+    read, prepare = [], learner.loss.prepare
+    monkeypatch.setattr(
+        learner.loss, "prepare", lambda batch: (read.append(batch), prepare(batch))[1]
+    )
+    batch = stream(4, 6, seed=6).sequences()
+    for window in range(2):
+        batch["next", "reward"] = torch.full((4, 6, 1), float(window))
+        learner.update(batch, 24 * window)
+    assert len(read[1]) == 4
+    assert set(read[1]["next", "reward"].unique().tolist()) == {0.0, 1.0}
+
+
 def test_stored_targets_are_those_of_the_network_that_collected_them():
     trainer = Trainer(
         config(
@@ -447,19 +470,21 @@ def test_stored_targets_are_those_of_the_network_that_collected_them():
     whole.make_value_estimator(gamma=numbers.gamma, lmbda=numbers.lam)
     expected = look_into(whole, batch)[1]
     trainer.learner.update(batch, 0)
+    assert "stored_target" not in batch
     drawn = trainer.learner.replay.sample(ENVS, torch.Generator())
     torch.testing.assert_close(drawn["stored_target"], expected, atol=1e-5, rtol=1e-5)
 
 
-def test_the_target_network_is_renewed_every_so_many_updates():
-    trainer = Trainer(config("dqn", dqn={"target_every": 2}))
+@pytest.mark.parametrize("every", [1, 2])
+def test_the_target_network_is_renewed_every_so_many_updates(every):
+    trainer = Trainer(config("dqn", dqn={"target_every": every}))
     seen = []
     for _ in range(4):
         before = trainer.network.head.weight.detach().clone()
         trainer.update()
         target = trainer.learner.loss.target_value_network_params["head", "weight"].data
         seen.append(torch.equal(target, before))
-    assert seen == [True, False, True, False]
+    assert seen == [number % every == 0 for number in range(4)]
 
 
 @pytest.mark.parametrize("memory", ["lru", "mingru", "gru"])

@@ -35,6 +35,9 @@ def test_stored_targets_are_used_as_they_are():
     torch.testing.assert_close(found.detach(), error.mean(), atol=1e-5, rtol=1e-5)
     found = make_loss(network, burn_in=2)(s.sequences().set("stored_target", target))["loss"]
     torch.testing.assert_close(found.detach(), error[:, 2:].mean(), atol=1e-5, rtol=1e-5)
+    lends = make_loss(network, bootstrap="last")  # the last step, which has no target
+    found = lends(s.sequences().set("stored_target", target))["loss"]
+    torch.testing.assert_close(found.detach(), error[:, :-1].mean(), atol=1e-5, rtol=1e-5)
     stored = look_into(loss, s.sequences())[1]  # by the same network: as if worked out now
     same = loss(s.sequences().set("stored_target", stored))["loss"]
     torch.testing.assert_close(same, loss(s.sequences())["loss"])

@@ -86,6 +86,21 @@ def test_the_oldest_leaves_when_the_capacity_is_reached():
         SequenceReplay(0)
 
 
+def test_as_many_of_the_oldest_leave_as_the_newest_needs_room():
+    batches = windows(5)
+    ones = [batch[:1] for batch in batches[:4]]
+    replay = filled([*ones, batches[4]], capacity=4)
+    assert len(replay) == 4
+    assert (everything(replay) == torch.cat([ones[3], batches[4]])).all()
+
+
+def test_entries_that_share_memory_are_stored():
+    batch = windows(1)[0]
+    batch["again"] = batch["action"]
+    drawn = everything(filled([batch]))
+    assert torch.equal(drawn["again"], batch["action"])
+
+
 def test_it_goes_on_from_a_saved_moment(tmp_path):
     batches = windows(6)
     replay = filled(batches[:4], capacity=9, folder=tmp_path)  # the first has left
@@ -103,6 +118,8 @@ def test_it_goes_on_from_a_saved_moment(tmp_path):
         state
     )  # until the next checkpoint one may have to begin here again
     assert again.state_dict() == replay.state_dict()
+    replay.load_state_dict(state)  # and in its own place
+    assert (everything(replay) == torch.cat(batches[1:4])).all()
 
 
 def test_files_stay_as_long_as_a_kept_checkpoint_names_them(tmp_path):
@@ -129,6 +146,28 @@ def test_a_file_that_is_not_whole_is_refused(tmp_path, how):
     file.unlink() if how == "missing" else file.write_bytes(file.read_bytes()[:-3] + b"abc")
     with pytest.raises(CheckpointError, match=how):
         SequenceReplay(100, tmp_path).load_state_dict(state)
+
+
+def test_a_file_that_is_damaged_between_two_checkpoints_is_whole_in_neither(tmp_path):
+    replay = filled(windows(2), folder=tmp_path)
+    states = [replay.state_dict()]
+    resumed = SequenceReplay(100, tmp_path)
+    resumed.load_state_dict(states[0])
+    file = sorted(tmp_path.iterdir())[0]
+    file.write_bytes(file.read_bytes()[:-3] + b"abc")
+    states += [replay.state_dict(), resumed.state_dict()]
+    for state in states:
+        with pytest.raises(CheckpointError, match="damaged"):
+            SequenceReplay(100, tmp_path).load_state_dict(state)
+
+
+def test_outcomes_of_another_type_are_refused():
+    first, second = windows(2)
+    replay = filled([first])
+    second["next", "reward"] = second["next", "reward"].double()
+    with pytest.raises(CheckpointError, match="holds other frames than the windows before it"):
+        replay.add(second)
+    assert (everything(replay) == first).all()
 
 
 def test_frames_of_another_size_than_those_at_hand_are_refused_in_one_line():

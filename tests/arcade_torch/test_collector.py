@@ -7,6 +7,8 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+import jax
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -20,6 +22,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from arcade_torch.collector import ArcadeCollector
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.env import ArcadeEnv
+from arcade_torch.final_observations import _OneGame
 from tests.arcade_torch.stub import GAME, LOCKSTEP, MIXED, StubGame
 from tests.few import a_third
 
@@ -114,9 +117,11 @@ def test_batches_of_an_env_with_its_state_in_the_tensordict_lack_only_the_state(
     assert_same(ours.exclude("collector"), rollout.exclude("state", ("next", "state")))
 
 
-def test_compact_batches_lack_only_the_next_frames() -> None:
-    full = list(stub_collector(scripted, total_frames=3 * N * T))
-    compact = list(stub_collector(scripted, total_frames=3 * N * T, compact_obs=True))
+@pytest.mark.parametrize("overlap", [0, 2])
+def test_compact_batches_lack_only_the_next_frames(overlap: int) -> None:
+    options = {"total_frames": 3 * N * T, "overlap": overlap}
+    full = list(stub_collector(scripted, **options))
+    compact = list(stub_collector(scripted, compact_obs=True, **options))
     for one, two in zip(full, compact, strict=True):
         assert_same(one.exclude(("next", "pixels")), two)
 
@@ -220,13 +225,50 @@ def scripted_small(td: TensorDictBase) -> TensorDictBase:
     return td.set("action", (3 * td["step_count"].squeeze(-1) + td["last_action"]) % 5)
 
 
-def test_a_game_that_truncates_before_its_time_limit_is_named() -> None:
+def test_a_window_may_begin_and_end_with_a_truncation() -> None:
+    """Every place is used: more would be a game that truncates before its time limit."""
+    steps = LOCKSTEP.batched.game.max_steps + 1
+    rollout = stub_env(LOCKSTEP).rollout(6 * steps, scripted, break_when_any_done=False)
+    collector = stub_collector(
+        scripted, LOCKSTEP, frames_per_batch=N * steps, final_frames="truncated"
+    )
+    fully = []
+    for window in range(6):
+        batch = collector.collect()
+        assert batch["final_index"].shape == (N, 2)
+        path = rollout[:, window * steps : (window + 1) * steps]
+        assert torch.equal(dense_next_pixels(batch), path["next", "pixels"])
+        fully.append(bool(path["next", "truncated"][:, [0, -1]].all()))
+    assert any(fully)
+
+
+@pytest.mark.parametrize("ends", [0.005, 0.012, 0.05, 1.0])
+@pytest.mark.parametrize("num_envs", [2, 96])
+def test_final_frames_are_drawn_in_portions_of_one_shape(num_envs: int, ends: float) -> None:
+    """Whatever ends when: all once and in order, of few steps at once."""
+    game = _OneGame(None, slice(0, num_envs), 8, 8, jax.devices("cpu")[0])
+    most = 12 if num_envs == 96 else 2  # an eighth
+    for seed in range(20):
+        wanted = np.random.default_rng(seed).random((num_envs, 40)) < ends
+        steps, rows = np.nonzero(wanted.T)
+        portions = list(game.portions(rows, steps))
+        assert all(len(some) <= most for some, _ in portions)
+        assert all(len(set(some.tolist())) <= 8 for _, some in portions)
+        for whole, parts in zip((rows, steps), zip(*portions, strict=True), strict=False):
+            assert np.array_equal(np.concatenate(parts), whole)
+        assert len(rows) == sum(len(some) for some, _ in portions)
+
+
+@pytest.mark.parametrize("max_steps", [20, 4])
+def test_a_game_that_truncates_before_its_time_limit_is_named(max_steps: int) -> None:
+    """Also one truncation more than there are places for."""
+
     class Impatient(StubGame):
         def step(self, key: Any, state: Any, action: Any) -> Any:
             following, reward, terminated, _ = super().step(key, state, action)
             return following, reward, terminated, following.clock.count >= 2
 
-    compiled = CompiledGame(Impatient(risk=0.0))
+    compiled = CompiledGame(Impatient(risk=0.0, max_steps=max_steps))
     with pytest.raises(RuntimeError, match="truncated an episode before its max_steps"):
         stub_collector(scripted, compiled, final_frames="truncated").collect()
     assert stub_collector(scripted, compiled).collect()["next", "truncated"].any()
@@ -479,8 +521,12 @@ def test_seeding_starts_over_and_repeats() -> None:
     collector.collect()
     collector.set_seed(5)
     assert_same(collector.collect(), first)
-    other = ArcadeCollector(stub_env(seed=8), None, N * T, seed=5)
-    assert_same(other.collect(), first)
+    for seed in (5, 0):
+        other = ArcadeCollector(stub_env(seed=8), None, N * T, seed=seed)
+        collector.set_seed(seed)
+        assert_same(other.collect(), collector.collect())
+    assert collector.set_seed(5) == stub_env().set_seed(5)
+    assert collector.set_seed(5, static_seed=True) == 5
 
 
 def test_random_actions_differ_from_collector_to_collector() -> None:
@@ -537,6 +583,24 @@ def test_a_change_of_observability_between_windows_is_seen_at_once() -> None:
     assert (
         batch["pixels"][:, :, 1:4] == 0
     ).all()  # the stub's partial frames hide the serial number
+
+
+def test_final_frames_show_the_twin_that_each_step_showed() -> None:
+    """Before: all of a window showed the twin of its last end, so partial ones the whole state."""
+
+    def turning(env: ArcadeEnv) -> Callable[[TensorDictBase], TensorDictBase]:
+        twins = itertools.cycle(["full"] * 4 + ["partial"] * 4)
+
+        def policy(td: TensorDictBase) -> TensorDictBase:
+            env.set_observability(next(twins))
+            return scripted(td)
+
+        return policy
+
+    env, twin = stub_env(HASTY), stub_env(HASTY)
+    rollout = twin.rollout(3 * T, turning(twin), break_when_any_done=False)
+    batches = ArcadeCollector(env, turning(env), N * T, 3 * N * T)
+    assert_same(torch.cat(list(batches), 1).exclude("collector"), rollout)
 
 
 def rollout_of(env: ArcadeEnv) -> None:
@@ -745,6 +809,47 @@ def test_an_overlap_without_the_next_frames_that_batches_show_is_refused(mode: A
     collector.collect()
     with pytest.raises(ValueError, match="saved overlap 'dense/pixels' is None"):
         stub_collector(scripted, overlap=2).load_state_dict(collector.state_dict())
+
+
+def test_after_a_state_that_was_refused_windows_are_whole() -> None:
+    """Before: the overlap was half that of the refused state, which no memory had acted."""
+    saved = stub_collector(Recurrent(), overlap=3, final_frames="truncated")
+    saved.collect()
+    collector = stub_collector(Recurrent(), seed=77, overlap=3)
+    collector.collect()
+    with pytest.raises(ValueError, match="saved overlap"):
+        collector.load_state_dict(saved.state_dict())
+    for _ in range(2):
+        batch = collector.collect()
+        assert torch.equal(replay(batch), batch["total"])
+        assert torch.equal(batch["is_init"][:, 1:], batch["next", "done"][:, :-1])
+
+
+def test_weights_that_a_state_lacks_are_refused_unless_they_may() -> None:
+    head = nn.Sequential(nn.Linear(3, 5), nn.Flatten(0, -2))
+    policy = TensorDictSequential(
+        TensorDictModule(lambda frames: frames[:, 0, 0].float(), ["pixels"], ["x"]),
+        TensorDictModule(head, ["x"], ["q"]),
+        TensorDictModule(lambda q: q.argmax(-1), ["q"], ["action"]),
+    )
+    collector = stub_collector(policy)
+    state = collector.state_dict()
+    weights = dict(state["policy_state_dict"])
+    name = next(iter(weights))
+    state["policy_state_dict"] = {key: value for key, value in weights.items() if key != name}
+    with pytest.raises(RuntimeError, match=re.escape(name)):
+        collector.load_state_dict(state)
+    collector.load_state_dict(state, strict=False)
+    del state["policy_state_dict"]
+    collector.load_state_dict(state, strict=False)
+    collector.collect()
+
+
+def test_a_recurrent_state_of_another_policy_is_refused() -> None:
+    collector = stub_collector(Recurrent())
+    collector.collect()
+    with pytest.raises(ValueError, match="the saved recurrent state is not one of this policy"):
+        stub_collector(None).load_state_dict(collector.state_dict())
 
 
 def test_a_state_of_other_sizes_is_refused() -> None:

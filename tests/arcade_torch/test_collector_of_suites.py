@@ -104,6 +104,36 @@ def test_a_saved_collector_goes_on_with_the_same_batches(name: str) -> None:
         assert not different(other.collect(), batch)
 
 
+@pytest.mark.parametrize(("name", "mode"), [("both", "all"), ("tree", "truncated")])
+def test_what_is_written_to_a_batch_does_not_come_back_in_the_overlap(name: str, mode: Any) -> None:
+    """Final observations of the overlap are among it, also where it is longer than a window."""
+    plain = collector_of(name, overlap=T + 3, final_frames=mode)
+    other = collector_of(name, overlap=T + 3, final_frames=mode)
+    env = plain.env
+    for window in range(3):
+        expected = plain.collect()
+        batch = other.collect()
+        assert not different(used(batch, env), used(expected, env)), window
+        for value in batch.values(True, True):
+            if value.dtype is not torch.uint8:
+                value.zero_()
+    saved = other.state_dict()
+    resumed = collector_of(name, overlap=T + 3, final_frames=mode)
+    resumed.load_state_dict(saved)
+    assert not different(used(resumed.collect(), env), used(plain.collect(), env))
+
+
+def used(batch: TensorDict, env: Any) -> TensorDict:
+    """A batch in which unused places of final observations are 0."""
+    batch = batch.copy()
+    if "final_mask" in batch:
+        for key in env.observation_keys:
+            final = batch[final_key(key)].clone()
+            final[~batch["final_mask"]] = 0
+            batch[final_key(key)] = final
+    return batch
+
+
 def test_random_actions_are_those_that_the_spec_allows() -> None:
     for name in ("done", "plain"):
         env = made(name)

@@ -1,6 +1,7 @@
 """Frames are written where earlier ones were, and never where somebody can still see one."""
 
 import re
+import weakref
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -20,7 +21,7 @@ from arcade_torch import make
 from arcade_torch.collector import ArcadeCollector
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.env import ArcadeEnv
-from arcade_torch.frame_memory import FrameMemory, draws_in_place
+from arcade_torch.frame_memory import FrameMemory, Reused, draws_in_place
 from arcade_torch.gym.batch import NumpyBatch
 from tests.arcade_torch.stub import GAME, LOCKSTEP, MIXED, State, StubGame
 
@@ -70,6 +71,15 @@ class Raw(Fused):
 def test_frames_that_nobody_holds_are_written_over(path: type[Fused], game: CompiledGame) -> None:
     step = path(game)
     assert len({step().data_ptr() for _ in range(40)}) <= 3
+
+
+def test_of_many_blocks_that_were_held_the_newest_few_are_kept() -> None:
+    reused = Reused(most=3)
+    blocks = [np.empty(1) for _ in range(6)]
+    held = [reused.hand_out(block, block[:]) for block in blocks]
+    kept = [weakref.ref(block) for block in blocks]
+    del blocks, held
+    assert [block() is not None for block in kept] == [False] * 3 + [True] * 3
 
 
 def places_of(monkeypatch: pytest.MonkeyPatch, memory: FrameMemory) -> list[int]:
@@ -435,12 +445,20 @@ def test_a_policy_may_hold_the_frames_that_it_saw(same: bool) -> None:
     )
 
 
-@pytest.mark.parametrize("without", [jax.disable_jit, jax.debug_nans])
-def test_where_jax_donates_nothing_windows_are_the_same(without: Callable[[bool], Any]) -> None:
-    one, twin = (ArcadeCollector(ArcadeEnv(GAME, N), scripted, N * 2) for _ in range(2))
-    with without(True):
-        slow = one.collect()
-    assert (slow == twin.collect()).all()
+@pytest.mark.parametrize("setting", ["jax_disable_jit", "jax_debug_nans", "jax_debug_infs"])
+def test_where_jax_donates_nothing_windows_are_the_same(setting: str) -> None:
+    """The setting is the process's, for steps compile in a thread of their own, and stands before
+    the game is compiled.
+    """
+    twin = ArcadeCollector(ArcadeEnv(GAME, N), scripted, N * 2)
+    game = CompiledGame(StubGame())
+    jax.config.update(setting, True)
+    try:
+        one = ArcadeCollector(ArcadeEnv(game, N), scripted, N * 2)
+        slow = [one.collect() for _ in range(2)]
+    finally:
+        jax.config.update(setting, False)
+    assert all((batch == twin.collect()).all() for batch in slow)
 
 
 def test_a_jax_that_draws_elsewhere_has_its_frames_copied(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -255,6 +255,31 @@ def test_a_policy_or_a_compression_that_raises_loses_its_window_alone(where: str
         follows_on(held)
 
 
+@pytest.mark.parametrize("windows", [0, 1])
+def test_a_collector_saved_after_a_lost_window_is_resumed_as_it_goes_on(windows: int) -> None:
+    """Before: the episodes that were saved were thrown away, and all envs began anew."""
+    acts = [0]
+
+    def act(td: TensorDictBase) -> TensorDictBase:
+        acts[0] += 1
+        if acts[0] == (windows + 1) * STEPS:
+            raise KeyboardInterrupt
+        return td.set("action", torch.zeros(N, dtype=torch.int64))
+
+    one = ArcadeCollector(ArcadeEnv(GAME, N, seed=3), act, N * STEPS)
+    other = ArcadeCollector(ArcadeEnv(GAME, N, seed=9), act, N * STEPS)
+    for _ in range(windows):
+        one.collect()
+    with pytest.raises(KeyboardInterrupt):
+        one.collect()
+    other.load_state_dict(one.state_dict())
+    expected = next(one.iterator())
+    assert expected["step_count"][:, 0].any(), "an episode must go on"
+    batch = next(other.iterator())
+    for key in expected.keys(True, True):
+        assert torch.equal(batch[key], expected[key]), key
+
+
 def test_compiled_functions_that_were_cleared_are_compiled_again() -> None:
     one, twin = collector(), collector(compress=torch.clone)
     for _ in range(3):

@@ -2,6 +2,7 @@
 above 2 ** 24.
 """
 
+import copy
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,13 +10,16 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer
+from tensordict import TensorDict, TensorDictBase
+from torch import nn
+from torchrl.data import LazyTensorStorage, SliceSampler, TensorDictReplayBuffer, Unbounded
+from torchrl.envs import TensorDictPrimer
 
 import arcade_torch
 from arcade_torch import ArcadeCollector, ArcadeEnv
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.envs_jax.validation import check_fits
+from arcade_torch.rollout_buffer import TensorMemory
 from tests.arcade_torch.stub import StubGame
 
 N = 4
@@ -104,16 +108,20 @@ def test_no_slice_spans_two_episodes_after_a_reset() -> None:
     assert torch.equal(counts[:, 1:], counts[:, :-1] + 1)
 
 
-def test_a_saved_collector_goes_on_with_its_numbers() -> None:
+@pytest.mark.parametrize("between", ["nothing", "collect"])
+def test_a_saved_collector_goes_on_with_its_numbers(between: str) -> None:
     one = collector()
-    next(one.iterator())
+    seen = ids(next(one.iterator()))
+    if between == "collect":
+        one.collect()
     saved = one.state_dict()
     other = collector()
     other.load_state_dict(saved)
+    batch = next(other.iterator())
     assert torch.equal(
-        next(one.iterator())["collector", "traj_ids"],
-        next(other.iterator())["collector", "traj_ids"],
+        next(one.iterator())["collector", "traj_ids"], batch["collector", "traj_ids"]
     )
+    assert bool(seen & ids(batch)) == (between == "nothing")
 
 
 # -- torch's defaults ------------------------------------------------------------------------------
@@ -284,6 +292,66 @@ def test_what_is_written_to_a_batch_does_not_come_back_in_the_overlap(
     resumed = collector(overlap=3, final_frames=mode)
     resumed.load_state_dict(saved)
     assert torch.equal(resumed.collect()["next", "reward"], plain.collect()["next", "reward"])
+
+
+@pytest.mark.parametrize("mode", ["all", "truncated", "none"])
+def test_nothing_of_what_memory_held_before_is_seen_in_a_batch(
+    mode: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = {"overlap": 3, "final_frames": mode}
+    expected = collector(**options).collect()
+    take = TensorMemory.take
+    monkeypatch.setattr(TensorMemory, "take", lambda memory: take(memory).fill_(171))
+    batch = collector(**options).collect()
+    for key, value in expected.items(True, True):
+        assert torch.equal(batch[key], value), key
+
+
+def test_a_state_dict_does_not_change_when_the_collector_goes_on() -> None:
+    """Also where storage is shared, and where the policy writes all its states into one tensor."""
+    own = torch.zeros(N, 1)
+
+    class Counting(nn.Module):
+        in_keys = ("is_init", "count")
+        out_keys = ("action", ("next", "count"))
+
+        def make_tensordict_primer(self) -> TensorDictPrimer:
+            return TensorDictPrimer(count=Unbounded((1,)))
+
+        def forward(self, td: TensorDictBase) -> TensorDictBase:
+            td["next", "count"] = own.copy_(td["count"] + 1)
+            return td.set("action", own.squeeze(-1).long() % 5)
+
+    for mode in ("all", "truncated"):
+        one = ArcadeCollector(
+            ArcadeEnv(GAME, N, seed=3),
+            Counting(),
+            N * STEPS,
+            overlap=3,
+            final_frames=mode,  # type: ignore[arg-type]
+            return_same_td=True,
+        )
+        next(one.iterator()) if mode == "all" else one.collect()
+        state = one.state_dict()
+        del state["policy_state_dict"]
+        before = copy.deepcopy(state)
+        one.collect()
+        assert_equal(state, before)
+
+
+def assert_equal(one: Any, other: Any) -> None:
+    """Nested dictionaries and lists of tensors and numbers."""
+    if isinstance(one, torch.Tensor):
+        assert torch.equal(one, other)
+    elif isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key, value in one.items():
+            assert_equal(value, other[key])
+    elif isinstance(one, list):
+        for value, expected in zip(one, other, strict=True):
+            assert_equal(value, expected)
+    else:
+        assert one == other
 
 
 def test_no_two_entries_of_a_batch_and_no_two_batches_share_memory() -> None:

@@ -243,7 +243,7 @@ def rows_of(game: Any, num_envs: int, rows: int) -> Callable[[Any], Any]:
         batch = put(batch_shapes(game, num_envs))
         index = put(jax.ShapeDtypeStruct((2, rows), "int32"))
         first = put(jax.ShapeDtypeStruct((), "int32"))
-        return game.draw_rows[0].trace([batch.state] * 8, batch.partial, index, first, None)
+        return game.draw_rows[0].trace([batch.state] * 8, [batch.partial] * 8, index, first, None)
 
     return trace
 
