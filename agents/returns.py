@@ -3,6 +3,7 @@ TorchRL.
 """
 
 from contextlib import nullcontext
+from numbers import Real
 from typing import Any
 
 import torch
@@ -16,7 +17,6 @@ from arcade_torch.agents.checked import Count, Fraction, coerce, require
 from arcade_torch.agents.config import TimeLimit
 from arcade_torch.agents.layout import NetworkInputs, insert_final_observations, unroll
 from arcade_torch.envs_jax.validation import format_value, plain
-from arcade_torch.models.arguments import is_number
 
 
 def q_lambda_return(
@@ -177,7 +177,8 @@ def _is_fraction(value: Any) -> bool:
     """Whether a value is one number in [0, 1]."""
     if isinstance(value, Tensor):
         return value.numel() == 1 and bool((value >= 0.0) & (value <= 1.0))
-    return is_number(value) and 0.0 <= value <= 1.0
+    is_real = isinstance(value, Real) and not isinstance(value, bool)
+    return is_real and 0.0 <= value <= 1.0
 
 
 def solve_backward(base: Tensor, trace: Tensor) -> Tensor:

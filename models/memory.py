@@ -257,7 +257,9 @@ def batch_shape(batch_size: int | Sequence[int]) -> list[int]:
         ValueError: they are not whole numbers from 0.
     """
     sizes = list(batch_size) if isinstance(batch_size, Sequence) else [batch_size]
-    if not all(is_whole(size) and size >= 0 for size in sizes):
+    for size in sizes:
+        if (type(size) is int or is_whole(size)) and size >= 0:
+            continue
         raise ValueError(f"batch_size must be whole numbers from 0, got {batch_size!r}")
     return sizes
 
