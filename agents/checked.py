@@ -47,18 +47,16 @@ def require(condition: bool, name: str, value: Any, allowed: str) -> None:
         raise ValueError(f"{name} must be {allowed}; got {one_line}")
 
 
-def whole_number(name: str, value: Any, least: int) -> int:
+def whole_from(least: int, name: str, value: Any) -> int:
     """A whole number as an int, of numpy too; refuse anything else, and one below the least
     (ValueError).
     """
     try:
-        number = operator.index(value)
+        fits = operator.index(value) >= least and not isinstance(value, bool)
     except TypeError:
-        number = None
-    if number is None or isinstance(value, bool):
-        require(False, name, value, f"a whole number, and at least {least}")
-    require(number >= least, name, value, f"at least {least}")  # type: ignore[operator]
-    return number  # type: ignore[return-value]
+        fits = False
+    require(fits, name, value, f"a whole number, and at least {least}")
+    return operator.index(value)
 
 
 def coerce(name: str, value: Any, kind: Any) -> Any:

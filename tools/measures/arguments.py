@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from arcade_torch.agents.checked import coerce, require, whole_number
+from arcade_torch.agents.checked import coerce, require, whole_from
 
 __all__ = [
     "check_flags",
@@ -23,8 +23,8 @@ def check_played(seed: Any, observability: Any = None, **counts: tuple[Any, int]
     no whole numbers from their least value on.
     """
     for name, (value, least) in counts.items():
-        whole_number(name, value, least)
-    whole_number("seed", seed, 0)
+        whole_from(least, name, value)
+    whole_from(0, "seed", seed)
     check_twin(observability)
 
 
@@ -49,20 +49,26 @@ def check_flags(**flags: Any) -> None:
 
 def check_strengths(name: str, values: Any) -> None:
     """Refuse what are not finite numbers from 0, one at least."""
-    fits = isinstance(values, Sequence) or hasattr(values, "tolist")
     allowed = "numbers of at least 0"
-    require(fits and not isinstance(values, str) and len(values) > 0, name, values, allowed)
-    for value in values:
-        is_number = hasattr(value, "__float__") and not isinstance(value, bool)
-        require(is_number and 0 <= float(value) < math.inf, name, list(values), allowed)
+    for value in _several(name, values, allowed):
+        require(_is_finite_from_0(value), name, list(values), allowed)
 
 
 def check_whole(name: str, values: Any) -> None:
     """Refuse what are not whole numbers from 0, one at least; 2.0 is one."""
     allowed = "whole numbers of at least 0"
-    fits = isinstance(values, Sequence) or hasattr(values, "tolist")
-    require(fits and not isinstance(values, str) and len(values) > 0, name, values, allowed)
-    for value in values:
-        is_number = hasattr(value, "__float__") and not isinstance(value, bool)
-        is_whole = is_number and 0 <= float(value) < math.inf and float(value) == int(value)
+    for value in _several(name, values, allowed):
+        is_whole = _is_finite_from_0(value) and float(value) == int(value)
         require(is_whole, name, list(values), allowed)
+
+
+def _several(name: str, values: Any, allowed: str) -> Any:
+    """The values of a list or an array that has some; anything else is refused."""
+    is_list = isinstance(values, Sequence) or hasattr(values, "tolist")
+    require(is_list and not isinstance(values, str) and len(values) > 0, name, values, allowed)
+    return values
+
+
+def _is_finite_from_0(value: Any) -> bool:
+    is_number = hasattr(value, "__float__") and not isinstance(value, bool)
+    return is_number and 0 <= float(value) < math.inf

@@ -28,7 +28,7 @@ from typing import Any, Literal, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from arcade_torch.agents.checked import require, whole_number
+from arcade_torch.agents.checked import require, whole_from
 from arcade_torch.tools.measures.arguments import check_played
 from arcade_torch.tools.measures.beliefs.recording import (
     CLASSES,
@@ -178,7 +178,7 @@ def beliefs_of(recording: Recording, seed: int = 0) -> Beliefs:
     Raises:
         ValueError: too few episodes, or no fact that varies.
     """
-    whole_number("seed", seed, 0)
+    whole_from(0, "seed", seed)
     episodes = len(recording.lengths)
     require(episodes >= MIN_EPISODES, "episodes", episodes, f"at least {MIN_EPISODES}")
     split = Split.of(recording.lengths, recording.states.shape[1], seed)

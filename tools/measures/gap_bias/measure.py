@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from arcade_torch.agents.checked import coerce, require, whole_number
+from arcade_torch.agents.checked import coerce, require, whole_from
 from arcade_torch.envs_jax.registry import DIFFICULTIES, is_mixture
 from arcade_torch.tools.measures import bootstrap
 from arcade_torch.tools.measures.bootstrap import Array, Interval, percentile_interval
@@ -205,8 +205,8 @@ def gap_and_bias(
     """
     confidence = coerce("confidence", confidence, float)
     require(0 < confidence < 1, "confidence", confidence, "between 0 and 1")
-    draws = whole_number("draws", draws, 1)
-    seed = whole_number("seed", seed, 0)
+    draws = whole_from(1, "draws", draws)
+    seed = whole_from(0, "seed", seed)
     cells = _cells(read_scores(runs, metric))
     baselines = _baselines(cells, baseline)
     games = list(dict.fromkeys(game for _, game, _ in cells))

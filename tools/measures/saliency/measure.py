@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from arcade_torch.agents.checked import require, whole_number
+from arcade_torch.agents.checked import require, whole_from
 from arcade_torch.models.arguments import is_whole
 from arcade_torch.tools.measures.frames import as_array, channel_axis, float_type
 from arcade_torch.tools.measures.keys import Names
@@ -134,7 +134,7 @@ def _check_options(reduce: str, norm: str, chunk: int, target: str, dtype: Any) 
             "the sum of all probabilities is always 1: take reduce per_action, or target logits"
         )
     check_norm(reduce, norm)
-    whole_number("chunk", chunk, 1)
+    whole_from(1, "chunk", chunk)
     is_float = isinstance(dtype, torch.dtype) and dtype.is_floating_point
     require(dtype is None or is_float, "dtype", dtype, "a floating one of torch")
 
