@@ -128,6 +128,14 @@ def _memories_as_before() -> Iterator[None]:
         registry._FACTORIES.update(before)
 
 
+@pytest.fixture(autouse=True)
+def _import_path_as_before() -> Iterator[None]:
+    """Forget folders of ``--import`` files: a module beside one hides a name from other tests."""
+    before = list(sys.path)
+    yield
+    sys.path[:] = before
+
+
 _GIGABYTE = 2**30
 _most_bytes = 4 * _GIGABYTE
 

@@ -6,6 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from torch import nn
+
 from arcade_torch.agents.checked import coerce, require, whole_from
 
 __all__ = [
@@ -15,6 +17,7 @@ __all__ = [
     "check_twin",
     "check_white",
     "check_whole",
+    "no_policy",
 ]
 
 
@@ -72,3 +75,17 @@ def _several(name: str, values: Any, allowed: str) -> Any:
 def _is_finite_from_0(value: Any) -> bool:
     is_number = hasattr(value, "__float__") and not isinstance(value, bool)
     return is_number and 0 <= float(value) < math.inf
+
+
+def no_policy(model: Any) -> str:
+    """What is said to somebody whose model is no policy."""
+    forms = (
+        "an agent, a TensorDict policy, a network with encode and remember, a Policy or a pair "
+        "(encode, remember)"
+    )
+    advice = ""
+    if isinstance(model, nn.Module):
+        name = type(model).__name__
+        advice = f': TensorDictModule({name}, ["pixels"], ["action_value"]) makes a policy of it'
+        advice += "; docs/measures/your-own.md says how with a recurrent state"
+    return f"model must be {forms}, got {type(model).__name__}{advice}"

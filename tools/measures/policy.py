@@ -34,7 +34,7 @@ from torch import Tensor, nn
 from arcade_torch.agents.forward import evaluating, state_of, state_of_rows
 from arcade_torch.models.actor_critic import ActorCriticNetwork
 from arcade_torch.models.networks import MemoryNetwork
-from arcade_torch.tools.measures.arguments import check_white
+from arcade_torch.tools.measures.arguments import check_white, no_policy
 from arcade_torch.tools.measures.frames import float_type, floats_are_taken
 from arcade_torch.tools.measures.keys import Channels, Keys, Names, refuse_unknown
 from arcade_torch.tools.measures.masked import are_near, refuse_nan
@@ -317,7 +317,7 @@ def as_policy(model: Any, **names: Unpack[Names]) -> Policy:
     elif isinstance(model, TensorDictModuleBase):
         return _of_module(model, names)
     else:
-        raise TypeError(_no_policy(model))
+        raise TypeError(no_policy(model))
     return _renamed(policy, names) if names else policy
 
 
@@ -407,20 +407,6 @@ def _renamed(policy: Policy, names: Names) -> Policy:
 
 RENAMES = ("pixels_key", "action_key", "last_action_key", "is_init_key", "channels", "white")
 """The keywords of `as_policy` that any policy takes."""
-
-
-def _no_policy(model: Any) -> str:
-    """What is said to somebody whose model is no policy."""
-    forms = (
-        "an agent, a TensorDict policy, a network with encode and remember, a Policy or a pair "
-        "(encode, remember)"
-    )
-    advice = ""
-    if isinstance(model, nn.Module):
-        name = type(model).__name__
-        advice = f': TensorDictModule({name}, ["pixels"], ["action_value"]) makes a policy of it'
-        advice += "; docs/measures/your-own.md says how with a recurrent state"
-    return f"model must be {forms}, got {type(model).__name__}{advice}"
 
 
 def resolve(model: Any, target: str) -> str:

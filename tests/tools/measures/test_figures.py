@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from matplotlib.colors import to_hex
+from tensordict.nn import TensorDictModule
 
 from arcade_torch.agents import Agent, preset, train
 from arcade_torch.agents.runs.files import read_csv
@@ -778,7 +779,8 @@ def weight_of(agent: Any) -> Weight:
 def test_other_weights_in_the_same_folder_are_measured_anew(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    agent = Agent(preset("smoke", env="MineSweeperEasy"), torch.nn.Linear(1, 1))
+    network = TensorDictModule(torch.nn.Linear(1, 1), ["pixels"], ["action_value"])
+    agent = Agent(preset("smoke", env="MineSweeperEasy"), network)
     monkeypatch.setattr(checkpoints, "load_agent", lambda path: agent)
     (tmp_path / "config.json").write_text("{}")
     for value in (1.0, 2.0, 1.0):
@@ -821,7 +823,8 @@ def test_weights_of_any_type_are_told_apart(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before: NumPy knows no bfloat16, and every measure of such an agent ended in a TypeError."""
-    agent = Agent(preset("smoke", env="MineSweeperEasy"), Typed())
+    network = TensorDictModule(Typed(), ["pixels"], ["action_value"])
+    agent = Agent(preset("smoke", env="MineSweeperEasy"), network)
     monkeypatch.setattr(checkpoints, "load_agent", lambda path: agent)
     (tmp_path / "config.json").write_text("{}")
     for value in (1.0, 1.0078125):  # neighbours

@@ -243,7 +243,7 @@ def test_what_noise_is_of_no_strength_is_refused() -> None:
     names = {"initial_state": TensorDict(known.start, [])}
     with pytest.raises(ValueError, match=r"^delays must be whole numbers of at least 0"):
         contamination(known.module, CueEnv(), delays=(0, 1.5), **names)
-    with pytest.raises(ValueError, match=r"^white must be above 0; got 0"):
+    with pytest.raises(ValueError, match=r"^white must be a number above 0; got 0"):
         contamination(known.module, CueEnv(), white=0.0, **names)
 
 

@@ -426,9 +426,7 @@ def shuffle_order(total: int, first: int, last: int, rng: np.random.Generator) -
 def replayed(
     policy: Policy, window: Window, features: Tensor, changed: int, feedback: bool
 ) -> Tensor:
-    """What the memory says at every step of several versions of a trajectory that differ from frame
-    ``changed`` on.
-    """
+    """What the memory says at every step of trajectories that differ from frame ``changed`` on."""
     count = features.shape[0]
     # Up to the first difference nothing has been chosen by the replay yet: the recorded actions
     # lead there.
