@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDictBase
+from torchrl.modules import recurrent_mode, set_recurrent_mode
 
 from arcade_torch import ArcadeCollector, ArcadeEnv
 from arcade_torch.compiled import CompiledGame
@@ -30,6 +31,13 @@ BRIDGE = Path(__file__).resolve().parents[2] / "arcade_torch"
 
 def collector(game: Any = GAME, **options: Any) -> ArcadeCollector:
     return ArcadeCollector(ArcadeEnv(game, N, seed=3), None, N * STEPS, seed=1, **options)
+
+
+@pytest.fixture(autouse=True)
+def _recurrent_mode_as_before() -> Iterator[None]:
+    """An interrupt between the instructions of TorchRL's own switch leaves it on for later tests."""
+    with set_recurrent_mode(recurrent_mode()):
+        yield
 
 
 # -- at random moments, in a process of its own ----------------------------------------------------
