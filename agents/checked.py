@@ -51,12 +51,14 @@ def whole_from(least: int, name: str, value: Any) -> int:
     """A whole number as an int, of numpy too; refuse anything else, and one below the least
     (ValueError).
     """
+    allowed = f"a whole number, and at least {least}"
+    require(not isinstance(value, bool), name, value, allowed)
     try:
-        fits = operator.index(value) >= least and not isinstance(value, bool)
-    except TypeError:
-        fits = False
-    require(fits, name, value, f"a whole number, and at least {least}")
-    return operator.index(value)
+        number = operator.index(value)
+    except TypeError as error:
+        raise ValueError(f"{name} must be {allowed}; got {value!r}") from error
+    require(number >= least, name, value, f"at least {least}")
+    return number
 
 
 def coerce(name: str, value: Any, kind: Any) -> Any:
