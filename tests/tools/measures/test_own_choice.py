@@ -57,6 +57,17 @@ def test_a_policy_that_chooses_otherwise_is_refused(measure: str) -> None:
         MEASURES[measure](choosing(worst))
 
 
+def measure_in_batches(measure: str, policy: Any, env: ToyEnv, batches: int) -> None:
+    """A measure over so many batches of an env that plays two episodes side by side."""
+    episodes = 2 * batches
+    if measure == "recall density":
+        recall_density(policy, env, episodes=episodes)
+    elif measure == "counterfactual":
+        counterfactual(policy, env, episodes=episodes, donors=1)
+    else:
+        contamination(policy, env, delays=(0, 1), starts=1 if batches == 1 else 40)
+
+
 @pytest.mark.parametrize("measure", DECISIONS)
 def test_a_mask_behind_the_outputs_that_counts_late_is_refused(measure: str) -> None:
     """The first frames, on which a policy is tried, do not show it."""
@@ -67,14 +78,8 @@ def test_a_mask_behind_the_outputs_that_counts_late_is_refused(measure: str) -> 
         steps += 1
         return best(values) if steps % 6 else worst(values)
 
-    env = ToyEnv([9, 9])
-    run: dict[str, Callable[[Any], Any]] = {
-        "recall density": lambda policy: recall_density(policy, env, episodes=2),
-        "counterfactual": lambda policy: counterfactual(policy, env, episodes=2, donors=1),
-        "contamination": lambda policy: contamination(policy, env, delays=(0, 1), starts=1),
-    }
     with pytest.raises(ValueError, match=REFUSED):
-        run[measure](choosing(masked))
+        measure_in_batches(measure, choosing(masked), ToyEnv([9, 9]), 1)
 
 
 @pytest.mark.parametrize("measure", DECISIONS)
@@ -93,13 +98,8 @@ def test_another_choice_in_a_later_batch_is_refused(measure: str) -> None:
     def late(values: Tensor) -> Tensor:
         return best(values) if env.batches < 2 else worst(values)
 
-    run: dict[str, Callable[[Any], Any]] = {
-        "recall density": lambda policy: recall_density(policy, env, episodes=4),
-        "counterfactual": lambda policy: counterfactual(policy, env, episodes=4, donors=1),
-        "contamination": lambda policy: contamination(policy, env, delays=(0, 1), starts=40),
-    }
     with pytest.raises(ValueError, match=REFUSED):
-        run[measure](choosing(late))
+        measure_in_batches(measure, choosing(late), env, 2)
     assert env.batches == 2
 
 

@@ -159,8 +159,7 @@ def beliefs(
     Raises:
         ValueError: an option is out of range, the env names no facts, or all of them are constant.
     """
-    counts = {"episodes": (episodes, MIN_EPISODES), "max_steps": (max_steps, 1)}
-    check_played(seed, observability, **counts)
+    check_played(seed, observability, episodes=(episodes, MIN_EPISODES), max_steps=(max_steps, 1))
     player, env = resolve_agent(agent, env, observability, **names)
     recording = record(
         player, env, episodes=episodes, max_steps=max_steps, seed=seed, progress=progress

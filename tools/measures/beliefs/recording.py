@@ -73,8 +73,7 @@ def record(
 
     Everything is as for `arcade_torch.tools.beliefs`.
     """
-    counts = {"episodes": (episodes, MIN_EPISODES), "max_steps": (max_steps, 1)}
-    check_played(seed, **counts)
+    check_played(seed, episodes=(episodes, MIN_EPISODES), max_steps=(max_steps, 1))
     if not hasattr(env, "facts"):
         raise ValueError(
             f"{type(env).__name__} has no facts(): hand over an ArcadeEnv, or an env whose facts() "

@@ -113,8 +113,7 @@ def steering(
     Raises:
         ValueError: an option is out of range, or the env names no facts or holds a single episode.
     """
-    counts = {"episodes": (episodes, MIN_EPISODES), "max_steps": (max_steps, 1)}
-    check_played(seed, observability, **counts)
+    check_played(seed, observability, episodes=(episodes, MIN_EPISODES), max_steps=(max_steps, 1))
     player, env = resolve_agent(agent, env, observability, **names)
     played = EpisodeBatch(env, keys_of(player))
     size = played.size
