@@ -78,6 +78,28 @@ def test_contamination_has_a_panel_for_each_strength() -> None:
     np.testing.assert_allclose(drawn, changes.mean("change")[1])
 
 
+def test_effects_of_exchanges_stand_inside_their_panels() -> None:
+    """Before: the panel of all donors set the scale, and what differing donors do was cut off."""
+    exchanges = counterfactual(policy_of(), Foreign(), episodes=6, donors=2, **NAMES)
+    differs = np.zeros_like(exchanges.differs)
+    differs[..., 0] = 1
+    memory_differs = np.zeros_like(exchanges.memory_differs)
+    memory_differs[..., 0] = 1
+    of_one_donor = replace(
+        exchanges,
+        change=3 * differs,
+        differs=differs,
+        memory_change=3 * memory_differs,
+        memory_differs=memory_differs,
+    )
+    figure = counterfactual_figure({"gru": of_one_donor}, effect="change")
+    figure.canvas.draw()
+    for axis, level in zip(figure.axes, (1.5, 3), strict=True):
+        low, high = axis.get_ylim()
+        assert low == 0
+        assert axis.lines[0].get_ydata().max() == level < high
+
+
 def test_beliefs_have_bars_of_all_facts_and_a_panel_for_each() -> None:
     env = make("MineSweeperEasy", num_envs=8, observability="partial", seed=0)
     seeds = []

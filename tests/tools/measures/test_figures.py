@@ -204,6 +204,7 @@ def test_bars_are_drawn_where_their_numbers_say(monkeypatch: pytest.MonkeyPatch)
     assert np.array(bars) == pytest.approx(
         np.array([[0, 0.2], [0.2, 0.3], [0.5, 0.5]])
     )  # without the memory-free one
+    assert [axis.get_title() for axis in stacked.axes] == ["MDP"]  # no empty panel beside it
 
 
 def test_people_stand_beside_the_memory_free_agent_of_the_same_twin() -> None:

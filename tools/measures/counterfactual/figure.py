@@ -150,7 +150,7 @@ def _note(
     frames = "one frame" if options.block == 1 else f"{options.block} consecutive frames"
     return (
         f"{sample}; {options.episodes} decisions each, {frames} exchanged for those of up to "
-        f"{options.donors} other episodes at the same step;\n"
+        f"{options.donors} other episodes at the same step; "
         f"{STATE}: everything before the last frame is the other episode's"
     )
 
@@ -199,7 +199,7 @@ def plot(
     if effect in SHARES:
         axis.set_ylim(-0.03, 1.05)
     else:
-        axis.set_ylim(bottom=0)
+        axis.set_ylim(bottom=0, auto=True)  # panels that share it still widen it
 
 
 def counterfactual_figure(

@@ -167,8 +167,8 @@ def _without_both_twins(labels: Sequence[Label]) -> list[str]:
 
 
 def _stacked_bars(masses: Masses, bins: int) -> tuple[Any, str]:
-    """Two panels, MDP and POMDP; a bar a game, all memory models and seeds pooled; the darkest part
-    is most recent.
+    """A panel a twin that is there; a bar a game, all memory models and seeds pooled; the darkest
+    part is most recent.
     """
     remembering = {}
     for task, mass in masses.items():
@@ -177,8 +177,11 @@ def _stacked_bars(masses: Masses, bins: int) -> tuple[Any, str]:
     remembering = remembering or dict(masses)
     games = list(dict.fromkeys(game for _, game, _ in remembering))
     tasks = style.agents_by_task(remembering)
-    figure, axes = style.panels(1, 2, (max(8.0, 3.4 + 1.1 * len(games)), 4.2), sharey=True)
-    for axis, twin in zip(axes[0], TWIN_NAMES, strict=True):
+    measured_twins = {twin for _, _, twin in remembering}
+    twins = [twin for twin in TWIN_NAMES if twin in measured_twins]
+    width = max(2.4 + 2.8 * len(twins), 3.4 + 0.55 * len(twins) * len(games))
+    figure, axes = style.panels(1, len(twins), (width, 4.2), sharey=True)
+    for axis, twin in zip(axes[0], twins, strict=True):
         mass_of_game = {}
         for place, game in enumerate(games):
             agents = tasks.get((game, twin))
@@ -206,8 +209,7 @@ def _plot_stacked(masses: Mapping[int, Array], axis: Any, bins: int, shades: Seq
         axis.bar(places, parts[:, part], 0.7, below, color=colour, label=label)
     for level in np.arange(1, bins) / bins:
         axis.axhline(level, color=style.NEUTRAL, lw=0.9, ls=":", zorder=3)
-    if places:
-        axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), reverse=True, fontsize="small")
+    axis.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), reverse=True, fontsize="small")
 
 
 def _curves(measured: Densities, masses: Masses, bins: int, confidence: float) -> tuple[Any, str]:
