@@ -42,6 +42,7 @@ def test_a_log_that_is_a_pipe_or_a_link_is_refused(tmp_path: Path) -> None:
     assert end_of_worker(1, log) == "exit code 1"
     job(tmp_path).add_to_log("one\narcade-torch: last\n")
     assert end_of_worker(1, log) == "last"
+    assert end_of_worker(-9, log) == "ended by signal 9; its log ends with: last"
 
 
 class Returned:
