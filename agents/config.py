@@ -18,6 +18,7 @@ from arcade_torch.agents.checked import (
     Text,
     require,
 )
+from arcade_torch.envs_jax.validation import kind_of
 
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
 MOST_EPISODES = 2**16
@@ -409,6 +410,14 @@ class TrainConfig(Checked):
         for name, kind in GROUPS.items():
             values[name] = kind(**_fields_of(kind, values.get(name, {}), kind.GROUP))
         return cls(**values)
+
+
+def check_config(config: Any) -> None:
+    """Refuse what is no `TrainConfig` (TypeError)."""
+    if not isinstance(config, TrainConfig):
+        raise TypeError(
+            f"config must be a TrainConfig, as preset(...) gives; got {kind_of(config)}"
+        )
 
 
 def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:

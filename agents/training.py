@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.config import TrainConfig, check_config
 from arcade_torch.agents.evaluation import EvalResult, evaluate, make_eval_env
 from arcade_torch.agents.learner import NonFiniteError
 from arcade_torch.agents.metrics import paper_score
@@ -91,7 +91,9 @@ def train(
             checkpoint is good.
         LoggerError: the package of ``config.logger`` is missing. Nothing was changed.
         ValueError: the game, the memory model, the network or the device does not exist.
+        TypeError: ``config`` is none.
     """
+    check_config(config)
     config = dataclasses.replace(config, env=resolve_id(config.env))
     folder = RunFolder(Path(run_dir), imports)
     folder.check(config, resume)
