@@ -28,7 +28,7 @@ from arcade_torch.agents.runs.files import read_json, write_json
 from arcade_torch.agents.runs.lock import locked
 from arcade_torch.envs_jax import resolve_id
 from arcade_torch.tools.files import write_csv
-from arcade_torch.tools.imports import imports_of
+from arcade_torch.tools.imports import imports_of, is_as_it_was
 from arcade_torch.tools.machine import versions
 from arcade_torch.tools.names import bare_name, preset_size
 from arcade_torch.tools.options import command_line
@@ -313,7 +313,7 @@ def _check_imports(run: Run, plan: TrainConfig) -> None:
     """Refuse a run that was trained with a file that is imported otherwise, or not at all, now."""
     now = {entry["sha256"] for entry in imports_of(plan)}
     for name, sha256 in run.imports.items():
-        if sha256 not in now:
+        if sha256 not in now and not is_as_it_was(name, sha256):
             raise FileExistsError(
                 f"{run.path} was trained with {name} as it was before it changed: put it back, "
                 "delete that folder to train the run anew, or choose another --out"
