@@ -17,6 +17,7 @@ from torchrl.data import Categorical, Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule, ProbabilisticActor, QValueModule
 
+from arcade_torch.agents.batch_checks import check_module
 from arcade_torch.agents.checked import Count, Fraction, coerce, require
 from arcade_torch.agents.config import TrainConfig, check_config
 from arcade_torch.agents.forward import evaluating, last_outputs
@@ -108,11 +109,7 @@ def _check_writes(network: Any, *names: str) -> None:
     """Refuse what is no TensorDict module (TypeError), or writes none of some entries
     (ValueError).
     """
-    if not hasattr(network, "out_keys"):
-        raise TypeError(
-            f"a network must be a TensorDict module; got a {type(network).__name__}: "
-            "TensorDictModule(network, [what it reads], [what it writes])"
-        )
+    check_module(network)
     if not set(names) & set(network.out_keys):
         written = ", ".join(map(str, network.out_keys))
         raise ValueError(f"the network must write {' or '.join(names)}; it writes {written}")
