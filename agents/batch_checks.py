@@ -9,6 +9,7 @@ from torch import Tensor
 from torchrl.modules import GRUModule, LSTMModule
 
 from arcade_torch.agents.checked import require
+from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
 
@@ -92,6 +93,15 @@ def stored_numbers(
         number = one_a_step(key, steps[key].detach(), steps)
         numbers[key] = number if mask is None else number.where(mask.unsqueeze(-1), 0)
     return numbers
+
+
+def check_module(network: Any) -> None:
+    """Refuse a network that is no TensorDict module (TypeError)."""
+    if not hasattr(network, "in_keys") or not hasattr(network, "out_keys"):
+        raise TypeError(
+            f"a network must be a TensorDict module; got {kind_of(network)}: "
+            "TensorDictModule(network, [what it reads], [what it writes])"
+        )
 
 
 def check_state_keys(network: TensorDictModuleBase) -> None:

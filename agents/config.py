@@ -18,12 +18,15 @@ from arcade_torch.agents.checked import (
     Text,
     require,
 )
+from arcade_torch.envs_jax.validation import kind_of
 
 SEED_LIMIT = 2**30  # training seeds lie below, evaluation seeds above; see evaluation.held_out_seed
 MOST_EPISODES = 2**16
 """Of an evaluation. They are played side by side, one an environment: the frames of one step of so
 many take 3 GB at 128 pixels.
 """
+# more than a system has room for would end the process
+Threads = Annotated[int, Range("a whole number from 0 to 1024", lambda x: 0 <= x <= 1024)]
 # Names that are no options, because other fields decide them and learners rely on them.
 OF_ENV = (
     "id",
@@ -334,7 +337,7 @@ class TrainConfig(Checked):
     cuda_graphs: bool = False
     """Replay acting, and every whole gradient step (loss, backward pass, clipping, optimiser), as
     one CUDA graph each, which saves launches; needs a CUDA device."""
-    threads: CountOrZero = 0
+    threads: Threads = 0
     """Torch threads; 0 leaves the setting alone. With 1, several runs side by side are fastest in
     total.
     """
@@ -409,6 +412,14 @@ class TrainConfig(Checked):
         for name, kind in GROUPS.items():
             values[name] = kind(**_fields_of(kind, values.get(name, {}), kind.GROUP))
         return cls(**values)
+
+
+def check_config(config: Any) -> None:
+    """Refuse what is no `TrainConfig` (TypeError)."""
+    if not isinstance(config, TrainConfig):
+        raise TypeError(
+            f"config must be a TrainConfig, as preset(...) gives; got {kind_of(config)}"
+        )
 
 
 def _fields_of(cls: type, values: Any, prefix: str) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from torchrl.modules import set_recurrent_mode
 
 from arcade_torch.agents.batch_checks import (
     Key,
+    check_module,
     check_order,
     check_state_keys,
     check_stored_states,
@@ -25,7 +26,6 @@ from arcade_torch.agents.batch_checks import (
     is_stock,
     step_mask,
 )
-from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.rollout_buffer import final_key
@@ -37,11 +37,7 @@ class NetworkInputs:
     """
 
     def __init__(self, network: TensorDictModuleBase) -> None:
-        if not hasattr(network, "in_keys"):
-            raise TypeError(
-                f"a network must be a TensorDict module; got {kind_of(network)}: "
-                "TensorDictModule(network, [what it reads], [what it writes])"
-            )
+        check_module(network)
         check_state_keys(network)
         keys = [unravel_key(key) for key in network.in_keys]
         written = {unravel_key(key) for key in network.out_keys}

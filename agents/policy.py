@@ -17,8 +17,9 @@ from torchrl.data import Categorical, Composite
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.modules import EGreedyModule, ProbabilisticActor, QValueModule
 
+from arcade_torch.agents.batch_checks import check_module
 from arcade_torch.agents.checked import Count, Fraction, coerce, require
-from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.config import TrainConfig, check_config
 from arcade_torch.agents.forward import evaluating, last_outputs
 from arcade_torch.agents.runs.bundle import find_checkpoint
 from arcade_torch.agents.runs.checkpoint import Checkpoint
@@ -108,11 +109,7 @@ def _check_writes(network: Any, *names: str) -> None:
     """Refuse what is no TensorDict module (TypeError), or writes none of some entries
     (ValueError).
     """
-    if not hasattr(network, "out_keys"):
-        raise TypeError(
-            f"a network must be a TensorDict module; got a {type(network).__name__}: "
-            "TensorDictModule(network, [what it reads], [what it writes])"
-        )
+    check_module(network)
     if not set(names) & set(network.out_keys):
         written = ", ".join(map(str, network.out_keys))
         raise ValueError(f"the network must write {' or '.join(names)}; it writes {written}")
@@ -177,6 +174,7 @@ class Agent(TensorDictModuleBase):
 
     def __init__(self, config: TrainConfig, network: Network, frames: int = 0) -> None:
         super().__init__()
+        check_config(config)
         self.config = config
         self.network = network
         self.frames = frames
@@ -290,8 +288,9 @@ class Agent(TensorDictModuleBase):
 
 def build_network(config: TrainConfig) -> Network:
     """The freshly initialised network of a config, on its device; the same seed gives the same
-    weights, and no global draw moves.
+    weights, and no global draw moves; refuses what is no config (TypeError).
     """
+    check_config(config)
     # on the CPU, whatever torch's default device is: there the seed says what is drawn
     with plain_torch(), kept_generators(config.seed), torch.device("cpu"):
         network = _new_network(config)

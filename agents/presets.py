@@ -142,7 +142,7 @@ def preset(name: str, **changes: Any) -> TrainConfig:
         >>> preset("paper", algorithm="ppo").learner.learning_rate
         0.0001
     """
-    if name not in _PRESETS:
+    if not isinstance(name, str) or name not in _PRESETS:
         raise ValueError(f"unknown preset {name!r}; presets: {', '.join(preset_names())}")
     values = {"algorithm": TrainConfig.algorithm, "env": TrainConfig.env} | _PRESETS[name]
     algorithm = str(changes.get("algorithm", values["algorithm"]))

@@ -14,7 +14,7 @@ from torchrl.modules import EGreedyModule
 
 import arcade_torch
 from arcade_torch.agents.checked import require
-from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.config import TrainConfig, check_config
 from arcade_torch.agents.cuda_graph import GraphedPolicy
 from arcade_torch.agents.dqn import DQN
 from arcade_torch.agents.evaluation import make_env
@@ -61,9 +61,11 @@ class Trainer:
     Raises:
         ValueError: the device is not there; the game, the memory model, the network or one of their
             options is unknown.
+        TypeError: ``config`` is none.
     """
 
     def __init__(self, config: TrainConfig, replay_folder: Path | None = None) -> None:
+        check_config(config)
         self.config = config
         device, _ = pick_devices(config.device)  # refused here if it is not there
         self.random = (

@@ -4,10 +4,12 @@ the end, or to the first signal.
 
 import dataclasses
 import errno
+import math
 import os
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -17,7 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.config import TrainConfig, check_config
 from arcade_torch.agents.evaluation import EvalResult, evaluate, make_eval_env
 from arcade_torch.agents.learner import NonFiniteError
 from arcade_torch.agents.metrics import paper_score
@@ -43,7 +45,8 @@ class TrainResult:
     frames: int  # of training
     seconds: float  # spent collecting and learning
     evaluation: EvalResult | None = None  # greedy, at the end; None if interrupted
-    # the paper's score of the training curve; None where an env ended no episode
+    # the paper's score of the training curve; None where an env ended no episode, or one with a
+    # return that is not finite
     train_max_ewm: float | None = None
 
 
@@ -88,7 +91,9 @@ def train(
             checkpoint is good.
         LoggerError: the package of ``config.logger`` is missing. Nothing was changed.
         ValueError: the game, the memory model, the network or the device does not exist.
+        TypeError: ``config`` is none.
     """
+    check_config(config)
     config = dataclasses.replace(config, env=resolve_id(config.env))
     folder = RunFolder(Path(run_dir), imports)
     folder.check(config, resume)
@@ -247,7 +252,12 @@ class _Run:
         ]
         frames = [float(row["frames"]) for row in rows]
         returns = [float(row["train_return_last"]) for row in rows]
-        score = paper_score(frames, returns) if rows else None
+        is_finite = all(map(math.isfinite, returns))
+        if not is_finite:
+            warnings.warn(
+                "train_max_ewm is missing: a return of the training is not finite", stacklevel=3
+            )
+        score = paper_score(frames, returns) if rows and is_finite else None
         final = {
             "status": "finished",
             "frames": self.trainer.frames,

@@ -17,7 +17,7 @@ from arcade_torch.collector_arguments import check_arguments, check_options, che
 from arcade_torch.compiled import TERMINATED, TRUNCATED
 from arcade_torch.dlpack import is_host, to_torch
 from arcade_torch.env import ArcadeEnv
-from arcade_torch.envs_jax.validation import kind_of
+from arcade_torch.envs_jax.validation import kind_of, plain
 from arcade_torch.jax_env import JaxEnv
 from arcade_torch.policies import (
     ROOT_KEYS,
@@ -375,6 +375,7 @@ class ArcadeCollector(BaseCollector):
         Returns:
             A seed for whatever is made next; with ``static_seed`` the same one.
         """
+        seed = plain(seed)
         following: int = self.env.set_seed(seed, static_seed=static_seed)
         self._generator.manual_seed(seed)
         self.reset()

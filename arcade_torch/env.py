@@ -32,6 +32,7 @@ from arcade_torch.envs_jax.validation import (
     check_fits,
     check_num_envs,
     partial_flags,
+    plain,
 )
 from arcade_torch.final_observations import FinalObservations
 from arcade_torch.frame_memory import FrameMemory
@@ -527,6 +528,12 @@ class ArcadeEnv(BaseEnv):
             computed = env_keys(seed, self.num_envs)
         keys: jax.Array = jax.device_put(computed, self._jax_device)
         return keys
+
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> Any:
+        """Seed the batch, see TorchRL's `EnvBase`; a number of numpy or torch will do, of which
+        TorchRL alone makes no next seed.
+        """
+        return super().set_seed(plain(seed), static_seed)
 
     def _set_seed(self, seed: int | None) -> None:
         """Give every env a new random key and forget the last action; running episodes go on until

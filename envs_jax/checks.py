@@ -128,12 +128,12 @@ def _check_episode(game: Game[Any], reset: Any, step: Any, seed: int) -> tuple[i
         done = bool(terminated) or bool(truncated)
         if not done and length >= game.max_steps:
             raise ValueError(
-                f"{game.id}: neither terminated nor truncated after {length} steps, and max_steps "
+                f"{game.id}: neither terminated nor truncated up to step {length}, and max_steps "
                 f"is {game.max_steps}"
             )
         if truncated and length < game.max_steps:
             raise ValueError(
-                f"{game.id}: truncated after {length} steps, and max_steps is {game.max_steps}"
+                f"{game.id}: truncated in step {length}, and max_steps is {game.max_steps}"
             )
     lowest, highest = game.return_range
     if not lowest - _ROUNDING <= episode_return <= highest + _ROUNDING:
@@ -160,7 +160,7 @@ def _check_frames(game: Game[Any], state: Any, steps: int) -> bool:
         full = game.render(state, jnp.bool_(False))
         partial = game.render(state, jnp.bool_(True))
     except ValueError as error:
-        raise ValueError(f"{game.id}: render after {steps} steps: {error}") from error
+        raise ValueError(f"{game.id}: render after step {steps}: {error}") from error
     return not np.array_equal(full, partial)
 
 

@@ -178,8 +178,9 @@ class MemoryNetwork(TensorDictModuleBase):
         encoder: frames to features [..., E].
         block: a memory model, E + num_actions to H.
         head: [..., H] to [..., A], with a ``value_key`` to [..., A + 1].
-        num_actions: length of the one-hot last action; 0 leaves it out, and ``"last_action"`` is
-            not read.
+        num_actions: A, length of the one-hot last action; 0 leaves it out, and ``"last_action"`` is
+            not read. An action outside of 0 to A - 1, such as a -1 for none, is a zero vector:
+            nothing refuses it, since acting looks at no value and so never waits for a GPU.
         zero_action_on_reset: show a zero vector instead of the last action where ``is_init`` is
             set. Not with ``store="step"``: there TorchRL also sets ``is_init`` in mid-episode
             (slices, the next observations of ``GAE``).

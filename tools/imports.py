@@ -50,6 +50,7 @@ that lies beside a file and was imported by it also ``by``, that file."""
 _HASH = re.compile("[0-9a-f]{64}")
 _hashes: dict[str, str] = {}  # file that was imported in this process -> SHA-256 of its text
 _beside: dict[str, list[Import]] = {}  # such a file -> the modules beside it that it imported
+_before: dict[str, set[str]] = {}  # such a file -> the modules that there were before it
 _again: set[str] = set()  # what was imported in this process because a run remembers it
 
 
@@ -162,8 +163,30 @@ def imports_of(config: "TrainConfig") -> list[Import]:
     entries = list[Import]()
     for name in imported():
         entries.append({"name": name, "sha256": _hashes.get(name, "")})
-        entries += _beside.get(name, [])
+        _beside[name] = _beside_until_now(name)
+        entries += _beside[name]
     return entries
+
+
+def _beside_until_now(name: str) -> list[Import]:
+    """What stands beside a file and was imported by it, or later, by what it registers."""
+    entries = {entry["name"]: entry for entry in _beside.get(name, [])}
+    later = set(sys.modules) - _before.get(name, set(sys.modules))
+    for entry in _modules_beside(name, later):
+        if entry["name"] not in _hashes:
+            entries.setdefault(entry["name"], entry)
+    return list(entries.values())[:MOST_BESIDE]
+
+
+def is_as_it_was(name: str, sha256: str) -> bool:
+    """Whether a module that is imported late has the text that a run remembers; nothing is opened
+    but what lies beside a file that was imported in this process.
+    """
+    if not any(name.startswith(os.path.join(os.path.dirname(file), "")) for file in _hashes):
+        return False
+    with contextlib.suppress(OSError, ValueError):  # gone since, or no regular file
+        return hashlib.sha256(read_bytes(Path(name), MOST_SOURCE)).hexdigest() == sha256
+    return False
 
 
 def is_from_user(memory: str) -> bool:
@@ -281,16 +304,14 @@ def _import_again(run: Path, name: str, sha256: str) -> None:
 
 
 def _check_beside(run: Path, entries: Sequence[Import]) -> None:
-    """Refuse a run whose file imported a module beside it that is another now. Only what has been
-    imported is looked at.
-    """
+    """Refuse a run whose file imported a module beside it that is another now."""
     if not entries:
         return
     now = set[str]()
     for file in list(_hashes):
         now |= {entry["sha256"] for entry in _modules_beside(file, sys.modules)}
     for entry in entries:
-        if entry["sha256"] not in now:
+        if entry["sha256"] not in now and not is_as_it_was(entry["name"], entry["sha256"]):
             raise ImportRefusedError(
                 f"{run} imported {entry['name']} by way of {entry['by']}, and it has changed "
                 f"since: put it back, or pass {FLAG} {shlex.quote(str(entry['by']))} to take it as "
@@ -396,6 +417,7 @@ def _run_file(name: str, text: bytes | None, expected: str) -> None:
             del sys.modules[module]
             raise _changed(entry["name"])
     _hashes[name] = sha256
+    _before[name] = before
     _beside[name] = beside
 
 

@@ -1,4 +1,6 @@
-"""Memory models of a user: their check before a training."""
+"""Memory models of a user: their check before a training, and what they import only while they
+train.
+"""
 
 import traceback
 from dataclasses import replace
@@ -6,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.runs.files import read_json, write_json
 from arcade_torch.tools.errors import one_line
-from arcade_torch.tools.imports import is_from_user
+from arcade_torch.tools.imports import imports_of, is_from_user
 
 SKIP = "--no-check-memory trains it unchecked"
 
@@ -50,6 +53,34 @@ def check_memory_of(config: TrainConfig) -> None:
             f"memory {config.memory!r} was made with hidden_size={block.hidden_size}, and its y is "
             f"{width} wide: bring it to hidden_size, with a last nn.Linear for example"
         )
+
+
+class LateImports:
+    """Notes in a run's ``config.json`` what game and memory import only when they are run.
+
+    Called with every row of a training, as its ``progress``; it looks once, after the first update,
+    when everything has run.
+    """
+
+    def __init__(self, run: Path, config: TrainConfig) -> None:
+        self._file = run / "config.json"
+        self._config = config
+        self._is_noted = False
+
+    def __call__(self, row: Any) -> None:
+        """Look, and write."""
+        if self._is_noted:
+            return
+        self._is_noted = True
+        imports = imports_of(self._config)
+        if not imports:
+            return
+        record = read_json(self._file)
+        remembered = {entry["name"] for entry in record["imports"]}
+        late = [entry for entry in imports if entry["name"] not in remembered]
+        if late:
+            record["imports"] += late
+            write_json(self._file, record)
 
 
 def _width(cell: Any, input_size: int) -> int:

@@ -3,9 +3,11 @@
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import read_csv
+from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.tools.comparable import Runs, check_comparable, find_runs
 from arcade_torch.tools.names import AgentKey, agent_names, game_names
 from arcade_torch.tools.run_folders import RunFolders
@@ -51,9 +53,10 @@ def read_scores(runs: Source, metric: str = "eval_final") -> list[Score]:
         FileNotFoundError: a path does not exist.
         ValueError: the metric is unknown, a folder holds no finished run, runs may not be compared,
             a table lacks a column, or a run appears twice.
+        TypeError: ``runs`` is none of these.
     """
     require(metric in METRICS, "metric", metric, f"one of {', '.join(METRICS)}")
-    parts = [runs] if isinstance(runs, str | Path) else list(runs)
+    parts = _parts_of(runs)
     named: list[NamedScore] = []
     settings: list[Run] = []  # of the runs behind the scores, as far as they are known
     folders: list[Path] = []
@@ -79,6 +82,17 @@ def read_scores(runs: Source, metric: str = "eval_final") -> list[Score]:
     _check_cells(scores)
     check_comparable(Runs(tuple(settings)))
     return scores
+
+
+def _parts_of(runs: Any) -> list[str | Path | Score]:
+    """One path, or several, or scores, as a list; anything else is refused (TypeError)."""
+    parts = [runs] if isinstance(runs, str | Path) or not isinstance(runs, Iterable) else list(runs)
+    for part in parts:
+        if not isinstance(part, str | Path | Score):
+            raise TypeError(
+                f"runs must be paths of runs, studies or tables, or scores; got {kind_of(part)}"
+            )
+    return parts
 
 
 def _with_one_name(named: Sequence[NamedScore]) -> list[Score]:

@@ -2,8 +2,8 @@
 other.
 
 Each line of stdin is JSON: the words of a command line, and the log that takes what the command
-prints. A command that succeeds is answered with a line on stdout. One that fails ends the process
-with its exit code, since it may have left something behind; so does the end of stdin.
+prints. Each is answered with a line on stdout. A command that fails ends the process with its exit
+code, since it may have left something behind; so does the end of stdin.
 """
 
 import json
@@ -15,9 +15,9 @@ from pathlib import Path
 
 from arcade_torch import program
 from arcade_torch.agents.runs.files import open_append
-from arcade_torch.tools.cli import EXIT_OK, begin, main
+from arcade_torch.tools.cli import EXIT_FAILED, EXIT_OK, begin, main
 from arcade_torch.tools.machine import watch_parent
-from arcade_torch.tools.studies.processes import DONE
+from arcade_torch.tools.studies.processes import DONE, FAILED
 
 
 def serve(command: Callable[[Sequence[str]], int] = main) -> None:
@@ -39,13 +39,24 @@ def serve(command: Callable[[Sequence[str]], int] = main) -> None:
             _print_to(log.fileno())
         with warnings.catch_warnings():  # of a run before are given again, into its own log
             sys.argv = ["arcade-torch", *order["words"]]  # what a run notes of its beginning
-            code = command(order["words"])
+            code = _carry_out(command, order["words"], answers)
         if code != EXIT_OK:
             break
         program.wait_for_work()
         _print_to(nowhere)
         os.write(answers, DONE)
     program.leave(code)
+
+
+def _carry_out(command: Callable[[Sequence[str]], int], words: Sequence[str], answers: int) -> int:
+    """Carry out one command, and answer where it has failed: what the log ends with says why."""
+    code = EXIT_FAILED
+    try:
+        code = command(words)
+    finally:
+        if code != EXIT_OK:
+            os.write(answers, FAILED)
+    return code
 
 
 def _print_to(file: int) -> None:

@@ -11,12 +11,15 @@ from tensordict import TensorDict
 from torch import nn
 
 from arcade_torch.agents import (
+    Agent,
     DQNLoss,
     PPOLoss,
     PQNLoss,
     QLambdaEstimator,
     SequenceGAE,
     SequenceReplay,
+    Trainer,
+    build_network,
     evaluate,
     from_pretrained,
     gae,
@@ -24,7 +27,9 @@ from arcade_torch.agents import (
     make_actor,
     make_policy,
     paper_score,
+    preset,
     q_lambda_return,
+    train,
 )
 from arcade_torch.models import make_actor_critic, make_network
 
@@ -162,6 +167,21 @@ def test_a_replay_counts_in_whole_sequences(tmp_path):
     for wrong in NO_COUNTS:
         one_line("^count must be", replay.sample, wrong, torch.Generator())
     one_line("^device is 'no_such'", replay.sample, 2, torch.Generator(), "no_such")
+
+
+@pytest.mark.parametrize("wrong", [None, 3, "small", {}, object()])
+def test_a_config_is_one_of_this_package(wrong, network, tmp_path):
+    """An AttributeError from inside, or an agent that no measure can play."""
+    made = [build_network, Trainer, lambda config: train(config, tmp_path / "run")]
+    for call in (*made, lambda config: Agent(config, network)):
+        one_line(r"^config must be a TrainConfig, as preset\(...\) gives; got an?", call, wrong,
+                 kind=TypeError)  # fmt: skip
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_preset_has_a_name():
+    for wrong in (None, ["small"], {}, 3):
+        one_line("^unknown preset", preset, wrong)
 
 
 @pytest.mark.parametrize("device", ["no_such", "cuda:99", "cpu:x", ["cpu"]])

@@ -125,6 +125,7 @@ def test_a_preset_can_be_changed_down_to_its_learner():
         ({"seed": 2**30}, "seed"),
         ({"seed": 1.5}, "seed must be a whole number; got 1.5"),
         ({"threads": -1}, "threads"),
+        ({"threads": 100_000}, "threads"),  # the system has no room for them: the process aborts
         ({"eval_episodes": 0}, "eval_episodes"),
         ({"env": ""}, "env"),
         ({"env": 3}, "env must be a string; got 3"),

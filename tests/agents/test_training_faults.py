@@ -11,7 +11,9 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
+import jax.numpy as jnp
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -20,6 +22,9 @@ from arcade_torch.agents import CheckpointError, RunFolderError, load, preset, t
 from arcade_torch.agents.runs import files
 from arcade_torch.agents.runs.checkpoint import list_checkpoints
 from arcade_torch.agents.runs.files import checksum, read_json, write_json
+from arcade_torch.envs_jax import Game, make, register
+from arcade_torch.envs_jax.cartpole import CartPole
+from tests.own_registry import own_registry  # noqa: F401
 
 CONFIG = preset(
     "smoke", env="CartPoleEasy-v0", total_frames=640, eval_every=0, checkpoint_every=128
@@ -161,3 +166,32 @@ def test_a_disk_that_is_full_at_the_end_still_says_so(
         train(CONFIG, run, progress=progress)
     monkeypatch.undo()
     assert json.loads((run / "config.json").read_text())
+
+
+def test_a_return_that_is_not_finite_costs_the_training_score_and_not_the_run(
+    tmp_path: Path,
+    own_registry: None,  # noqa: F811
+) -> None:
+    """Before: the run failed at its last line, "returns must be finite"."""
+
+    class Huge(CartPole):
+        """Rewards that are finite, and whose sum is not."""
+
+        def step(self, key: Any, state: Any, action: Any) -> Any:
+            state, reward, terminated, truncated = super().step(key, state, action)
+            return state, jnp.full_like(reward, 3e38), terminated, truncated
+
+    def huge(*, id: str, obs_size: int, rules: str) -> Game[Any]:
+        game: Any = make("CartPoleEasy", obs_size=obs_size)
+        game.__class__ = Huge
+        game.id = id
+        return game  # type: ignore[no-any-return]
+
+    register("HugeEasy-v0", huge)
+    # nothing is learned from them before the replay holds so many
+    learner = {"learning_starts": 10_000, "replay_frames": 100_000}
+    config = preset("smoke", env="HugeEasy", algorithm="dqn", dqn=learner)
+    with pytest.warns(UserWarning, match=r"^train_max_ewm is missing: a return .* is not finite$"):
+        result = train(config, tmp_path / "run")
+    assert result.status == "finished" and result.train_max_ewm is None
+    assert read_json(tmp_path / "run" / "progress.json")["status"] == "finished"

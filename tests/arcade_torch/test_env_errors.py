@@ -3,10 +3,12 @@
 import re
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
 
+from arcade_torch.collector import ArcadeCollector
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.factory import make
 from tests.arcade_torch.stub import GAME
@@ -184,3 +186,15 @@ def test_none_is_no_twin_to_change_to() -> None:
     with pytest.raises(ValueError, match=r"^observability is None, allowed: 'full', 'partial'"):
         env.set_observability(None)  # type: ignore[arg-type]
     assert env.observability.all()
+
+
+def test_a_seed_may_be_a_number_of_numpy_or_torch() -> None:
+    """One of torch was refused by numpy, after it had been set."""
+    env = make("CartPoleEasy", num_envs=2)
+    following = env.set_seed(3)
+    for seed in (torch.tensor(3), np.int64(3)):
+        assert env.set_seed(seed) == following
+    assert env.set_seed(torch.tensor(3), static_seed=True) == 3
+    assert env.set_seed(None) is None
+    collector = ArcadeCollector(env, None, frames_per_batch=4)
+    assert collector.set_seed(torch.tensor(3)) == following

@@ -325,11 +325,11 @@ def step_paying(reward=0.2, ends=True, state=lambda s: s):
 PLAYED_WRONG = [
     (
         {"highest": 3},
-        "render after 4 steps: place 0 (Slot at x 43, y 1) has no picture 4: codes are 0 to 3",
+        "render after step 4: place 0 (Slot at x 43, y 1) has no picture 4: codes are 0 to 3",
     ),
     (
         {"step": step_paying(ends=False), "highest": 9},
-        "neither terminated nor truncated after 5 steps, and max_steps is 5",
+        "neither terminated nor truncated up to step 5, and max_steps is 5",
     ),
     (
         {
@@ -340,7 +340,7 @@ PLAYED_WRONG = [
                 ~state.seen[0],
             )
         },
-        "truncated after 1 steps, and max_steps is 5",
+        "truncated in step 1, and max_steps is 5",
     ),
     (
         {"step": step_paying(reward=0.3)},
@@ -397,7 +397,7 @@ def test_a_picture_beyond_the_end_of_an_episode_is_looked_at_too():
 
     reset = lambda self, key: Ending(jnp.int32(0))  # noqa: E731
     game = counter_with(reset=reset, step=step, render=render)
-    with pytest.raises(ValueError, match=r"render after 5 steps: place 0 .* has no picture 77"):
+    with pytest.raises(ValueError, match=r"render after step 5: place 0 .* has no picture 77"):
         check_game(game, play=True)
 
 

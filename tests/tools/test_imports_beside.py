@@ -37,6 +37,7 @@ def again(patch: pytest.MonkeyPatch) -> None:
     """Begin a new process."""
     in_a_new_process(patch)
     patch.setattr(imports, "_beside", {})
+    patch.setattr(imports, "_before", {})
     patch.delitem(sys.modules, "beside_yours", raising=False)
     importlib.invalidate_caches()
 
@@ -148,3 +149,66 @@ def test_what_a_run_says_of_modules_beside_is_not_opened(folder: Path) -> None:
     with pytest.raises(imports.ImportRefusedError, match="has changed since"):
         imports.import_again(folder)
     assert "yours" not in memory_names() and "beside_yours" not in sys.modules
+
+
+LATE = """
+from arcade_torch.models import register_memory
+from arcade_torch.models.lru import LRU
+
+
+class Yours(LRU):
+    def forward(self, *args):
+        import beside_yours
+
+        return super().forward(*args)
+
+
+register_memory("yours", Yours)
+"""
+
+
+@pytest.mark.parametrize("checked", ["", "--no-check-memory"])
+def test_a_module_that_is_imported_only_when_the_model_runs_is_remembered_too(
+    folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    checked: str,
+) -> None:
+    """It could be edited between start and resume, without a word."""
+    (folder / "yours.py").write_text(LATE)
+    given = ["--import", str(folder / "yours.py"), *([checked] if checked else [])]
+    assert cli.main(["train", *WORDS, "--out", str(folder / "run"), *given]) == cli.EXIT_OK
+    evaluate = ["evaluate", str(folder / "run"), "--episodes", "2"]
+    again(monkeypatch)
+    assert cli.main(evaluate) == cli.EXIT_OK
+    change(folder, monkeypatch)
+    capsys.readouterr()
+    assert cli.main(evaluate) == cli.EXIT_BAD_INPUT
+    said = capsys.readouterr().err
+    assert "beside_yours.py by way of" in said and "it has changed since: put it back" in said
+
+
+def test_a_study_goes_on_with_runs_that_import_late(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process that plans them runs no model, and has not imported what they do."""
+    (folder / "yours.py").write_text(LATE)
+    imports.load_extensions([str(folder / "yours.py")])
+    place = StudyFolder(folder / "s")
+    (cell,) = study().runs()
+    place.claim(study())
+    run = place.run(cell).path
+    settings = study().config(cell)
+    write_run(run, cell, 0.5, settings=settings.to_dict())
+    importlib.import_module("beside_yours")
+    (run / "config.json").write_text(
+        json.dumps({"config": settings.to_dict(), "imports": imports.imports_of(settings)})
+    )
+    assert "beside_yours.py" in (run / "config.json").read_text()
+    again(monkeypatch)
+    imports.load_extensions([str(folder / "yours.py")])
+    place.claim(study())
+    change(folder, monkeypatch)
+    imports.load_extensions([str(folder / "yours.py")])
+    with pytest.raises(FileExistsError, match=r"trained with .*beside_yours\.py as it was before"):
+        place.claim(study())

@@ -3,6 +3,8 @@ outside is written.
 """
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +44,46 @@ def test_a_log_that_is_a_pipe_or_a_link_is_refused(tmp_path: Path) -> None:
     assert end_of_worker(1, log) == "exit code 1"
     job(tmp_path).add_to_log("one\narcade-torch: last\n")
     assert end_of_worker(1, log) == "last"
+    assert end_of_worker(-9, log) == "ended by signal 9; its log ends with: last"
+
+
+CLAIM = """
+import sys
+from pathlib import Path
+from arcade_torch.tools.studies.folder import StudyFolder
+from tests.tools.fabricated import small_study
+plan = small_study(total_frames=int(sys.argv[2]))
+StudyFolder(Path(sys.argv[1] + sys.argv[2])).claim(plan)  # all that is slow the first time
+print("ready", flush=True)
+sys.stdin.readline()
+try:
+    StudyFolder(Path(sys.argv[1])).claim(plan)
+    print("begun")
+except FileExistsError as error:
+    print(error)
+"""
+
+
+def test_of_two_studies_that_begin_at_once_in_one_folder_the_second_is_refused(
+    tmp_path: Path,
+) -> None:
+    """Before: both began, and the configs of one took the place of the other's."""
+    words = [sys.executable, "-c", CLAIM, str(tmp_path / "study")]
+    both = []
+    for frames in ("2048", "4096"):
+        both.append(
+            subprocess.Popen(
+                [*words, frames], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+            )
+        )
+    for process in both:
+        assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    for process in both:
+        assert process.stdin is not None
+        process.stdin.write("\n")
+        process.stdin.flush()
+    said = sorted(process.communicate()[0] for process in both)
+    assert "holds study 'toy' with total_frames" in said[0] and said[1] == "begun\n"
 
 
 class Returned:

@@ -158,6 +158,13 @@ def test_a_worker_that_waits_ends_with_its_study(tmp_path: Path) -> None:
     assert not is_there(pid_of(tmp_path, 0))
 
 
+def test_a_worker_that_somebody_ends_without_a_word_says_so(tmp_path: Path) -> None:
+    """Before: the last line of progress was the reason, as if that were wrong."""
+    quits = "import os; print('64 of 512 frames', flush=True); os._exit(7)"
+    (result,) = python_engine().run(jobs(tmp_path, quits))
+    assert result.error == "ended without a word (exit code 7); its log ends with: 64 of 512 frames"
+
+
 def test_a_killed_worker_is_reported_with_its_signal(tmp_path: Path) -> None:
     (result,) = python_engine().run(jobs(tmp_path, "import os; os.kill(os.getpid(), 9)"))
     assert result.error == "ended by signal 9"

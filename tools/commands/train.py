@@ -12,7 +12,7 @@ from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.runs.files import check_writable, read_json, write_json
 from arcade_torch.tools.imports import existing_agent, import_again, imports_of, load_agent
-from arcade_torch.tools.memory_files import check_memory_of
+from arcade_torch.tools.memory_files import LateImports, check_memory_of
 from arcade_torch.tools.options import Command, at_least, command_line, name_and_value
 from arcade_torch.tools.options import parse as parse_options
 from arcade_torch.tools.text import say
@@ -127,9 +127,11 @@ class Train(Command):
             share = bfloat16_time(run)
             if share > SLOWER:
                 say(f"--amp costs time here: the encoder takes {share:.2f} times as long with it")
+        note_late = LateImports(folder, run)
         with Bars(unit="frames", first_line_s=0.0) as bars:
 
             def show(row: Any) -> None:
+                note_late(row)
                 bars.update(
                     str(folder), int(row["frames"]), int(row["total_frames"]), describe_row(row)
                 )

@@ -105,7 +105,7 @@ FIGURES = {
     "size-sweep": Entry(
         SweepOptions,
         "measures.gap_bias.figure.size_sweep",
-        "Gap and Bias by depth and width of the memory",
+        "Gap and Bias by depth and width of the memory, beside the memory-free agent",
         "--runs runs/size-sweep",
     ),
     "throughput": Entry(

@@ -3,14 +3,16 @@
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from torch import nn
 
 from arcade_torch.agents.checked import coerce, require, whole_from
+from arcade_torch.envs_jax.validation import kind_of
 
 __all__ = [
+    "check_by_name",
     "check_flags",
     "check_played",
     "check_strengths",
@@ -75,6 +77,15 @@ def _several(name: str, values: Any, allowed: str) -> Any:
 def _is_finite_from_0(value: Any) -> bool:
     is_number = hasattr(value, "__float__") and not isinstance(value, bool)
     return is_number and 0 <= float(value) < math.inf
+
+
+def check_by_name(argument: str, results: Any) -> None:
+    """Refuse what is no dictionary of results (TypeError), and an empty one."""
+    if not isinstance(results, Mapping):
+        raise TypeError(
+            f"{argument} must be a dictionary of results by name; got {kind_of(results)}"
+        )
+    require(len(results) > 0, argument, dict(results), "of one policy at least")
 
 
 def no_policy(model: Any) -> str:

@@ -1,14 +1,30 @@
-"""Whether a policy chooses the best of its outputs, as measures of decisions take for granted."""
+"""Decisions of a policy, and whether it chooses the best of its outputs, as measures of decisions
+take for granted.
+"""
 
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from arcade_torch.tools.measures.masked import refuse_nan
 from arcade_torch.tools.measures.policy import HALF_ROUNDING, ROUNDING, as_policy
 
 if TYPE_CHECKING:
     from arcade_torch.tools.measures.windows import Window
+
+
+def decide(player: Any, obs: Any, state: Any) -> tuple[Tensor, Any]:
+    """Greedy actions int64 [N] of a `Policy`, or of what acts as an agent does, and the next state.
+
+    Raises:
+        ValueError: it decides by outputs that are no numbers.
+    """
+    action, extras, state = player.act(obs, state)
+    for name in ("q_value", "logits"):
+        if name in extras:
+            refuse_nan(extras[name])
+    return action, state
 
 
 @torch.no_grad()

@@ -19,8 +19,9 @@ def refuse_nan(out: Tensor) -> None:
     if bool(wrong.any()):
         got = "NaN" if bool(out.isnan().any()) else "infinity, where minus infinity is a mask"
         raise ValueError(
-            f"the policy's outputs must be numbers, got {got}: its weights may hold some, or it "
-            "cannot read noisy pixels (clip=True keeps them in their range)"
+            f"the policy's outputs must be numbers, got {got}: its weights may hold some, its "
+            "state may grow beyond all bounds, or it cannot read noisy pixels (clip=True keeps "
+            "them in their range)"
         )
 
 

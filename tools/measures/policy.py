@@ -86,14 +86,18 @@ class Policy:
 
     def greedy(self, out: Tensor) -> Tensor:
         """The best action of outputs [..., R], int64 [...]."""
-        best: Tensor = self.read(out, "q" if "q" in self.offers else "logits").argmax(-1)
-        return best
+        return self._of_actions(out).argmax(-1)
+
+    def _of_actions(self, out: Tensor) -> Tensor:
+        """The numbers of actions [..., A] among outputs [..., R]."""
+        return self.read(out, "q" if "q" in self.offers else "logits")
 
     @torch.no_grad()
     def act(self, obs: Any, state: Any) -> tuple[Tensor, dict[str, Tensor], Any]:
         """Greedy actions for a batch of observations, as an agent gives them, in evaluation mode.
 
-        ``obs`` holds ``pixels`` [N, ...], ``last_action`` [N] and ``is_init`` [N, 1].
+        ``obs`` holds ``pixels`` [N, ...], ``last_action`` [N] and ``is_init`` [N, 1]. Outputs that
+        are no numbers are refused (ValueError).
         """
         with self.evaluating():
             if self.step is not None:
@@ -104,7 +108,9 @@ class Policy:
             actions = obs["last_action"].reshape(rows, 1)
             flags = obs["is_init"].reshape(rows, 1)
             out, state = self.remember(features, actions, flags, state_of_rows(state, rows))
-            return self.greedy(out[:, 0]), {}, state_of_rows(state, rows)
+            values = self._of_actions(out[:, 0])
+            refuse_nan(values)
+            return values.argmax(-1), {}, state_of_rows(state, rows)
 
     @torch.no_grad()
     def features(

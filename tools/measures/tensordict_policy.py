@@ -28,6 +28,7 @@ from arcade_torch.agents.checked import require
 from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.recurrence import Key
 from arcade_torch.tools.measures.keys import Names, action_index
+from arcade_torch.tools.measures.masked import refuse_nan
 from arcade_torch.tools.measures.tensordict_keys import (
     CHOOSERS,
     OFFERS,
@@ -216,7 +217,7 @@ class TensorDictPolicy:
         """The policy's greedy actions, int64 [N], by the whole module, and the next state.
 
         Raises:
-            ValueError: the actions are not discrete.
+            ValueError: the actions are not discrete, or the outputs no numbers.
         """
         pixels = obs["pixels"]
         step = TensorDict({self.keys.pixels: pixels}, [len(pixels)], device=pixels.device)
@@ -230,6 +231,9 @@ class TensorDictPolicy:
         for key, next_key in self.state_keys.items():
             after[key] = step[next_key]
         action = step.get(self.keys.action, None)
+        values = step.get(self.output.key, None)  # a sequence may keep them to itself
+        if values is not None:
+            refuse_nan(values)
         if action is not None:
             return action_index(action, self.keys.action), after
         out = torch.cat([step[key] for key in self.output.keys], -1)

@@ -19,7 +19,7 @@ from arcade_torch.envs_jax.registry import is_mixture
 from arcade_torch.envs_jax.validation import format_value
 from arcade_torch.tools.imports import load_agent
 from arcade_torch.tools.measures.arguments import check_played, check_twin
-from arcade_torch.tools.measures.choices import check_choices
+from arcade_torch.tools.measures.choices import check_choices, decide
 from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
 from arcade_torch.tools.measures.keys import Keys, Names
 from arcade_torch.tools.measures.policy import Policy, as_policy
@@ -215,7 +215,7 @@ def play(
             raise ValueError(f"an episode must end, got {t} steps without: give env a time limit")
         for row in (playing & (starts == t)).nonzero().flatten().tolist():
             states[row] = None if state is None else state[row : row + 1].clone()
-        action, _, state = agent.act(obs, state)
+        action, state = decide(agent, obs, state)
         rows = (playing & (starts <= t) & (t < starts + keep)).nonzero().flatten()
         seen = obs.select("pixels", "last_action", "is_init").set("action", action)
         obs, reward, done = episodes.step(action)

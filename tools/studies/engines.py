@@ -86,12 +86,14 @@ class Job(NamedTuple):
         """
         from arcade_torch.agents import TrainConfig, train
         from arcade_torch.agents.runs.folder import wait_until_free
+        from arcade_torch.tools.memory_files import LateImports
 
         load_extensions()  # of the process that made the job
         keep_freed_memory()
         wait_until_free(self.folder, GRACE_S)
         config = TrainConfig.from_dict(read_json(self.config))
-        result = train(config, self.folder, resume=True, imports=imports_of(config))
+        late = LateImports(self.folder, config)
+        result = train(config, self.folder, True, late, imports=imports_of(config))
         if result.status == "interrupted":
             raise KeyboardInterrupt
 

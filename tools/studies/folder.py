@@ -2,7 +2,8 @@
 
 ::
 
-    study.json            the study, its versions, the command of every run
+    study.json            the study, its versions, the command of every run; beside it the lock
+                          that is held while it is first written
     configs/NAME.json     the config of a run, which `arcade-torch train --config` takes
     results.csv           one row a run, in the order of the grid; the same to the bit on every
                           engine, interrupted or not
@@ -24,9 +25,10 @@ from typing import Any
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.differences import differing_fields
 from arcade_torch.agents.runs.files import read_json, write_json
+from arcade_torch.agents.runs.lock import locked
 from arcade_torch.envs_jax import resolve_id
 from arcade_torch.tools.files import write_csv
-from arcade_torch.tools.imports import imports_of
+from arcade_torch.tools.imports import imports_of, is_as_it_was
 from arcade_torch.tools.machine import versions
 from arcade_torch.tools.names import bare_name, preset_size
 from arcade_torch.tools.options import command_line
@@ -34,6 +36,9 @@ from arcade_torch.tools.runs import FREE, Run, described, read_record
 from arcade_torch.tools.studies.engines import Job
 from arcade_torch.tools.studies.grid import RunSpec, Study
 
+LOCK_LIMIT_S = 60.0
+"""So long another process may take to begin a study in the same folder."""
+_BEGINS_WITH = ("study.json", "study.json.lock")
 Row = dict[str, Any]
 _CELL = ("game", "observability", "memory", "agent", "algorithm", "seed")
 RESULT_COLUMNS = (
@@ -117,26 +122,39 @@ class StudyFolder:
         run with other settings, is refused by a ``FileExistsError``.
         """
         file = self.root / "study.json"
-        # Looked at before study.json, which another shard may be about to write.
-        foreign = self.root.exists() and not all(
-            path.name.startswith(".study.json.") for path in self.root.iterdir()
-        )
+        if not file.exists():
+            self._begin(study, command)
         old: dict[str, Any] = {}
-        if file.exists():
-            with contextlib.suppress(ValueError):
-                old = self.record()
-            if old:
-                self._check_same(self.load(), study)
-        elif foreign:
-            raise FileExistsError(
-                f"{self.root} is not empty and holds no study: choose another --out"
-            )
+        with contextlib.suppress(ValueError):
+            old = self.record()
+        if old:
+            self._check_same(self.load(), study)
         runs = {spec: self.run(spec) for spec in study.runs()}  # each is read once
         _check_finished(study, runs)
         _check_begun(study, runs)
         new = self._new_record(study, command, old)
         if new != old:
             write_json(file, new)
+
+    def _begin(self, study: Study, command: str) -> None:
+        """Write ``study.json`` where there is none, one process after the other: of two studies
+        that begin in one folder the second finds the first.
+        """
+        file = self.root / "study.json"
+        self._check_empty()
+        with locked(file, LOCK_LIMIT_S):
+            if not file.exists():
+                self._check_empty()
+                write_json(file, self._new_record(study, command, {}))
+
+    def _check_empty(self) -> None:
+        """Refuse a folder of other files than those that another shard writes as it begins."""
+        for path in self.root.iterdir() if self.root.exists() else ():
+            is_ours = path.name.startswith(".study.json.") or path.name in _BEGINS_WITH
+            if not is_ours or path.is_symlink():
+                raise FileExistsError(
+                    f"{self.root} is not empty and holds no study: choose another --out"
+                )
 
     def _check_same(self, before: Study, study: Study) -> None:
         """Refuse a study that has other settings than the one that stands here, or fewer runs."""
@@ -295,7 +313,7 @@ def _check_imports(run: Run, plan: TrainConfig) -> None:
     """Refuse a run that was trained with a file that is imported otherwise, or not at all, now."""
     now = {entry["sha256"] for entry in imports_of(plan)}
     for name, sha256 in run.imports.items():
-        if sha256 not in now:
+        if sha256 not in now and not is_as_it_was(name, sha256):
             raise FileExistsError(
                 f"{run.path} was trained with {name} as it was before it changed: put it back, "
                 "delete that folder to train the run anew, or choose another --out"

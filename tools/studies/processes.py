@@ -24,6 +24,8 @@ MOST_RUNS = 32
 """Runs that one process carries out."""
 DONE = b"done\n"
 """What a process says after a run that has succeeded."""
+FAILED = b"failed\n"
+"""What it says after one that has failed, before it ends: why is the last line of the log."""
 LONG_S = 600.0
 """A process that has worked for so many seconds takes no further run: long ones gain nothing."""
 
@@ -104,6 +106,7 @@ class Worker:
         self._answers: IO[bytes]
         self._begun_s = 0.0
         self._runs = 0
+        self._has_failed = False
 
     def take(self, job: Job | Command) -> None:
         """Begin with a run."""
@@ -127,11 +130,12 @@ class Worker:
         if answer is not None and DONE in answer:
             self.job = None
             return JobResult(job.name)
+        self._has_failed |= answer is not None and FAILED in answer
         if code is None:
             return None
         self.job = None
         self.wait(0.0)
-        return JobResult(job.name, end_of_worker(code, job.log))
+        return JobResult(job.name, end_of_worker(code, job.log, self._has_failed))
 
     def ask_to_stop(self) -> None:
         """Ask the process to end, after it has saved a run that is under way."""
@@ -193,15 +197,19 @@ class Worker:
         self._answers = process.stdout
         self._begun_s = time.monotonic()
         self._runs = 0
+        self._has_failed = False
 
 
-def end_of_worker(code: int, log: Path) -> str:
-    """Why a worker failed: its last words, and the signal that ended it."""
+def end_of_worker(code: int, log: Path, has_failed: bool = True) -> str:
+    """Why a worker ended: its last words, where it said that the run has failed; else the signal or
+    the exit code, and what stands last in its log.
+    """
     try:
         lines = read_end(log).strip().splitlines()
     except (OSError, ValueError):  # somebody removed it, or put something else in its place
         lines = []
     last = lines[-1].strip().removeprefix("arcade-torch: ") if lines else ""
-    if code < 0:
-        return f"ended by signal {-code}" + (f"; last words: {last}" if last else "")
-    return last or f"exit code {code}"
+    if code >= 0 and has_failed:
+        return last or f"exit code {code}"
+    end = f"ended by signal {-code}" if code < 0 else f"ended without a word (exit code {code})"
+    return end + (f"; its log ends with: {last}" if last else "")

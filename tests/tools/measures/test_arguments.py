@@ -11,16 +11,23 @@ from arcade_torch.agents import from_pretrained
 from arcade_torch.tools import (
     as_policy,
     beliefs,
+    beliefs_figure,
     contamination,
     contamination_example,
+    contamination_example_figure,
+    contamination_figure,
     counterfactual,
+    counterfactual_figure,
     gap_and_bias,
     greedy_window,
     patching,
     recall_density,
+    recall_density_figure,
     saliency,
+    saliency_figure,
     steering,
 )
+from tests.tools.measures.toys import linear_policy, window
 
 NO_COUNTS = (0, -1, 1.5, True, None, "2", math.nan)
 NO_SEEDS = (-1, 1.5, True, None, "1")
@@ -45,9 +52,9 @@ COUNTS = [
 MEASURES = list(dict.fromkeys(function for function, _ in COUNTS))
 
 
-def one_line(message, call, *args, **options):
+def one_line(message, call, *args, kind=ValueError, **options):
     """A call is refused by one line that matches."""
-    with pytest.raises(ValueError, match=message) as refused:
+    with pytest.raises(kind, match=message) as refused:
         call(*args, **options)
     assert "\n" not in str(refused.value)
 
@@ -134,3 +141,43 @@ def test_the_numbers_of_the_bootstrap_are_checked():
         one_line("^confidence must be", gap_and_bias, [], confidence=wrong)
     for wrong in NO_SEEDS:
         one_line("^seed must be", gap_and_bias, [], seed=wrong)
+
+
+def test_saliency_takes_lists_and_arrays_and_names_what_is_neither():
+    """A list was an AttributeError about ndim."""
+    policy = linear_policy(0.5, dtype=torch.float32)
+    seen = window(4)
+    actions = [0, 1, 2, 0]
+    flags = [True, False, False, False]
+    given = saliency(policy, seen.frames.numpy(), actions, flags)
+    tensors = saliency(policy, seen.frames, torch.tensor(actions), torch.tensor(flags))
+    assert (given.per_frame == tensors.per_frame).all()
+    one_line("the length of last_action must be that of frames", saliency, policy, seen.frames, [0])
+    for wrong in ("x", object(), [None] * 4):
+        message = "must be a tensor or an array; got an?"
+        one_line(f"^last_action {message}", saliency, policy, seen.frames, wrong, kind=TypeError)
+        one_line(f"^frames {message}", saliency, policy, wrong, kind=TypeError)
+        one_line(
+            f"^is_init {message}", saliency, policy, seen.frames, is_init=wrong, kind=TypeError
+        )
+
+
+def test_gap_and_bias_is_of_paths_or_scores():
+    for wrong in (None, 3, object(), [1], [None]):
+        one_line("^runs must be paths of runs, studies or tables, or scores; got an?",
+                 gap_and_bias, wrong, kind=TypeError)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "draw", [recall_density_figure, contamination_figure, beliefs_figure, counterfactual_figure]
+)
+def test_a_figure_is_of_results_by_name(draw):
+    for wrong in (None, 3, "x", [1, 2], object()):
+        one_line("must be a dictionary of results by name; got an?", draw, wrong, kind=TypeError)
+
+
+def test_a_figure_of_one_episode_is_of_what_the_measure_gave():
+    for wrong in (None, 3, "x", [1, 2], object(), [("a", "b")]):
+        one_line("^rows must be a list of", saliency_figure, wrong, kind=TypeError)
+        one_line("^example must be what contamination_example gave; got an?",
+                 contamination_example_figure, wrong, kind=TypeError)  # fmt: skip

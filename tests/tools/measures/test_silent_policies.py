@@ -237,3 +237,53 @@ def test_inference_mode_measures_what_is_measured_outside_of_it() -> None:
         seen = greedy_window(policy, ToyEnv([5]), seed=1)
     assert (inside.deltas == outside.deltas).all() and inside.deltas[0] > 0
     assert saliency(policy, seen.frames, seen.last_action, seen.is_init, seen.state).shares()[0] > 0
+
+
+class NanAtLast(nn.Module):
+    """Outputs that are no numbers from the seventh frame of an episode on: its first pixel counts
+    steps.
+    """
+
+    def forward(self, frames: Tensor) -> Tensor:
+        pixels = frames.float().flatten(-3)
+        return torch.where(pixels[..., :1] < 6, pixels[..., :3], torch.nan)
+
+
+def nan_functions() -> Any:
+    """A policy of two functions that gives NaN late."""
+    return Policy(NanAtLast(), lambda features, action, is_init, state: (features, state))
+
+
+def nan_module() -> Any:
+    """A TensorDict policy that does, and chooses by itself."""
+    choose = TensorDictModule(lambda out: out.argmax(-1), ["action_value"], ["action"])
+    values = TensorDictModule(NanAtLast(), ["pixels"], ["action_value"])
+    return TensorDictSequential(values, choose)
+
+
+class NanAgent:
+    """What acts as an agent does, with outputs beside its actions."""
+
+    network = nan_functions()
+
+    def initial_state(self, size: int) -> None:
+        """None: it has no memory."""
+
+    def act(self, obs: Any, state: Any) -> tuple[Tensor, dict[str, Tensor], Any]:
+        out = NanAtLast()(obs["pixels"])
+        return out.argmax(-1), {"q_value": out}, state
+
+
+@pytest.mark.parametrize("policy", [nan_functions, nan_module, NanAgent])
+@pytest.mark.parametrize("measure", ["patching", "beliefs", "greedy window"])
+def test_outputs_that_become_nan_late_are_no_decisions(
+    policy: Callable[[], Any], measure: str
+) -> None:
+    play = {
+        "patching": lambda steps: patching(policy(), KnownEnv([steps] * 8), episodes=8),
+        "beliefs": lambda steps: beliefs(policy(), KnownEnv([steps] * 8), episodes=8),
+        "greedy window": lambda steps: greedy_window(policy(), ToyEnv([steps])),
+    }[measure]
+    play(6)
+    with pytest.raises(ValueError, match="outputs must be numbers, got NaN"):
+        play(8)

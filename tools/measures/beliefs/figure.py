@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from arcade_torch.agents.checked import require
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.files import Table
+from arcade_torch.tools.measures.arguments import check_by_name
 from arcade_torch.tools.measures.beliefs import BeliefsOptions, measure
 from arcade_torch.tools.measures.beliefs.patching import OUTCOMES, Patches, patching
 from arcade_torch.tools.measures.beliefs.recording import MIN_EPISODES, NO_FACTS
@@ -199,7 +199,7 @@ def beliefs_figure(
     Returns:
         A matplotlib figure.
     """
-    require(len(probes) > 0, "probes", dict(probes), "of one policy at least")
+    check_by_name("probes", probes)
     scores = dict[str, OfAgent]()
     for name, given in probes.items():
         seeds = [given] if isinstance(given, measure.Beliefs) else given

@@ -20,6 +20,7 @@ from arcade_torch.agents.config import SEED_LIMIT
 from arcade_torch.tools.measures.arguments import check_played
 from arcade_torch.tools.measures.beliefs.recording import check_seen, first_row
 from arcade_torch.tools.measures.bootstrap import Array, Interval, pooled
+from arcade_torch.tools.measures.choices import decide
 from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
 from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.policy import FEW, Progress, policy_of
@@ -154,8 +155,8 @@ def _patch_batch(
         donors = draw_donors(rows, size, rng)
         # before the decision itself: acting may change the state in place
         given = None if state is None else state[torch.from_numpy(donors)].clone()
-        patched = agent.act(obs, given)[0]
-        action, _, state = agent.act(obs, state)
+        patched, _ = decide(agent, obs, given)
+        action, state = decide(agent, obs, state)
         actions = np.full((3, size), NOBODY, np.int64)
         decided = action.cpu().numpy()
         actions[0, rows] = decided[rows]

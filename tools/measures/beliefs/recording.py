@@ -13,6 +13,7 @@ from torch import Tensor
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import SEED_LIMIT
 from arcade_torch.tools.measures.arguments import check_played
+from arcade_torch.tools.measures.choices import decide
 from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
 from arcade_torch.tools.measures.policy import FEW, Progress, policy_of
 from arcade_torch.tools.measures.windows import held_out, keys_of
@@ -109,7 +110,7 @@ def _record_batch(agent: Any, played: EpisodeBatch, seed: int, max_steps: int) -
             seen.append(first_row(obs))
         facts = facts_of(played)
         features = policy.features(obs["pixels"])
-        action, _, state = agent.act(obs, state)
+        action, state = decide(agent, obs, state)
         steps.append((flat_state(state, size), features.float().cpu().numpy(), facts))
         lengths += playing.numpy()
         obs, _, done = played.step(action)

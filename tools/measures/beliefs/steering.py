@@ -33,6 +33,7 @@ from arcade_torch.tools.measures.beliefs.recording import (
     shifted_state,
 )
 from arcade_torch.tools.measures.bootstrap import Array
+from arcade_torch.tools.measures.choices import decide
 from arcade_torch.tools.measures.envs import EpisodeBatch, keeps_generator
 from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.policy import Progress, policy_of
@@ -260,7 +261,8 @@ def _steer_batch(
         if steps and len(rows) > 1 and count:
             # before the decision itself: acting may change the state in place
             given = state[torch.from_numpy(donors)].clone()
-            actions[2, rows] = agent.act(obs, given)[0].cpu().numpy()[rows]
+            exchanged, _ = decide(agent, obs, given)
+            actions[2, rows] = exchanged.cpu().numpy()[rows]
             for place, name in enumerate(directions.names):
                 last = len(steps) - 1
                 moves, is_other = directions.moves(name, last, before[name], donors)
@@ -268,9 +270,9 @@ def _steer_batch(
                 if is_other.any():
                     chance = directions.at_random(moves, last, rng)
                     for row, by in ((3 + place, moves), (3 + count + place, chance)):
-                        decided = agent.act(obs, shifted_state(state, by))[0].cpu().numpy()
-                        actions[row, is_other] = decided[is_other]
-        action, _, state = agent.act(obs, state)
+                        decision, _ = decide(agent, obs, shifted_state(state, by))
+                        actions[row, is_other] = decision.cpu().numpy()[is_other]
+        action, state = decide(agent, obs, state)
         decided = action.cpu().numpy()
         actions[0, rows] = decided[rows]
         if steps and len(rows) > 1:

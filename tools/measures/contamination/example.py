@@ -9,6 +9,7 @@ import numpy as np
 
 from arcade_torch.agents.checked import require
 from arcade_torch.envs_jax import ACTION_NAMES
+from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import style
 from arcade_torch.tools.measures.contamination import measure
@@ -39,6 +40,8 @@ def contamination_example_figure(
     Returns:
         A matplotlib figure.
     """
+    if not isinstance(example, measure.Example):
+        raise TypeError(f"example must be what contamination_example gave; got {kind_of(example)}")
     figure = need("matplotlib.pyplot").figure() if figure is None else figure
     n = example.frames.shape[1] - 1
     shuffle = example.hits[1] < 0

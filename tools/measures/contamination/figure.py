@@ -12,6 +12,7 @@ from arcade_torch.agents.checked import require
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.files import Table
+from arcade_torch.tools.measures.arguments import check_by_name
 from arcade_torch.tools.measures.bootstrap import Pooled, pooled
 from arcade_torch.tools.measures.checkpoints import (
     Label,
@@ -235,6 +236,7 @@ def contamination_figure(
     Returns:
         A matplotlib figure.
     """
+    check_by_name("changes", changes)
     seeds = dict[tuple[str, str, str], list[measure.Contamination]]()
     for agent, given in changes.items():
         seeds[agent, "", ""] = [given] if isinstance(given, measure.Contamination) else list(given)

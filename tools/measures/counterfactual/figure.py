@@ -11,6 +11,7 @@ from arcade_torch.agents.checked import require
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.files import Table
+from arcade_torch.tools.measures.arguments import check_by_name
 from arcade_torch.tools.measures.bootstrap import Array, Interval, Pooled, pooled_episodes
 from arcade_torch.tools.measures.checkpoints import (
     Label,
@@ -220,7 +221,7 @@ def counterfactual_figure(
     Returns:
         A matplotlib figure.
     """
-    require(len(effects) > 0, "effects", dict(effects), "of one policy at least")
+    check_by_name("effects", effects)
     require(effect in EFFECTS, "effect", effect, f"one of {', '.join(EFFECTS)}")
     figure = need("matplotlib.pyplot").figure() if figure is None else figure
     figure.set_size_inches(8.0, 3.2)

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from arcade_torch.agents.checked import require
 from arcade_torch.tools.comparable import listed
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress, style
 from arcade_torch.tools.figures.style import TWIN_NAMES
 from arcade_torch.tools.files import Table
+from arcade_torch.tools.measures.arguments import check_by_name
 from arcade_torch.tools.measures.bootstrap import Array, Pooled, pooled
 from arcade_torch.tools.measures.checkpoints import Label, by_task, checkpoints_of, measure_runs
 from arcade_torch.tools.measures.recall_density import DensityOptions, measure
@@ -287,7 +287,7 @@ def recall_density_figure(
     Returns:
         A matplotlib figure.
     """
-    require(len(densities) > 0, "densities", dict(densities), "of one policy at least")
+    check_by_name("densities", densities)
     figure = need("matplotlib.pyplot").figure() if figure is None else figure
     figure.set_size_inches(5.4, 3.2)
     figure.set_layout_engine("constrained")

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from arcade_torch.agents.checked import require
+from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.figures import Made, Picture, Progress
@@ -99,6 +100,8 @@ def saliency_figure(
     Returns:
         A matplotlib figure.
     """
+    if not isinstance(rows, Sequence) or not all(_is_row(row) for row in rows):
+        raise TypeError(f"rows must be a list of (title, frames, maps); got {kind_of(rows)}")
     require(len(rows) > 0, "rows", list(rows), "one at least")
     require(show >= 1, "show", show, "at least 1")
     for title, frames, maps in rows:
@@ -116,6 +119,11 @@ def saliency_figure(
             f"{title}; brightest {peak:.1e}", fontsize="small", x=0.01, ha="left", parse_math=False
         )
     return figure
+
+
+def _is_row(row: Any) -> bool:
+    """Whether it has the three parts of a `Row`, the first a title."""
+    return isinstance(row, tuple | list) and len(row) == 3 and isinstance(row[0], str)
 
 
 def _check_maps(title: str, frames: Sequence[int], maps: NDArray[np.floating]) -> None:

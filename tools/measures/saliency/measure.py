@@ -22,6 +22,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from arcade_torch.agents.checked import require, whole_from
+from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.models.arguments import is_whole
 from arcade_torch.tools.measures.frames import as_array, channel_axis, float_type
 from arcade_torch.tools.measures.keys import Names
@@ -99,10 +100,10 @@ def saliency(
     Raises:
         ValueError: a shape does not fit, n is out of range, an option has an unknown value, or the
             policy says other things when it acts frame by frame, or cuts its gradients.
-        TypeError: ``model`` has none of the forms above.
+        TypeError: ``model`` has none of the forms above, or frames are no array.
     """
     policy = as_policy(model, **names)
-    frames = torch.as_tensor(frames)
+    frames = _tensor("frames", frames)
     _check_options(reduce, norm, chunk, resolve(policy, target), dtype)
     dtype = dtype or float_type(frames)
     steps = _index(n, frames) + 1
@@ -154,8 +155,17 @@ def _index(n: int, frames: Tensor) -> int:
     return n % total
 
 
-def _one_a_frame(name: str, values: Tensor, frames: Tensor) -> Tensor:
+def _tensor(name: str, values: Any) -> Tensor:
+    """A tensor as it is, and one of an array or a list of numbers."""
+    try:
+        return torch.as_tensor(values)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise TypeError(f"{name} must be a tensor or an array; got {kind_of(values)}") from error
+
+
+def _one_a_frame(name: str, given: Any, frames: Tensor) -> Tensor:
     """One value a frame, [T], or one-hot [T, A]."""
+    values = _tensor(name, given)
     total = frames.shape[0]
     if values.ndim != 2 or values.shape[1] == 1:
         values = values.reshape(-1)
