@@ -293,7 +293,9 @@ class ArcadeCollector(BaseCollector):
         for key in env.observation_keys:
             observation[key] = Entry(tuple(obs[key].shape[1:]), obs[key].dtype)
         of_games = isinstance(env, ArcadeEnv)
-        limits = [game.max_steps for game in env.games] if of_games else [env.max_steps or 1]
+        limits = (
+            [game.max_steps for game in env.games] if of_games else [env.least_steps_to_truncation]
+        )
         return RolloutBuffer(
             self._num_envs,
             self._overlap,

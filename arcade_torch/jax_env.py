@@ -121,6 +121,11 @@ class JaxEnv(BaseEnv):
         """The time limit that is counted here; None where there is none, or the suite counts."""
         return self.suite.max_steps
 
+    @property
+    def least_steps_to_truncation(self) -> int:
+        """So many steps of an env lie between two truncations at least."""
+        return 1 if self.suite.truncates_itself else self.max_steps or 1
+
     def __repr__(self) -> str:
         """Env, number and device."""
         return (

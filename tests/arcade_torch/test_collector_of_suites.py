@@ -4,19 +4,22 @@ and what others do to the env.
 
 from typing import Any
 
+import jax
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
+from torchrl.data import Bounded
 from torchrl.envs import TransformedEnv
 
-from arcade_torch import ArcadeCollector
+from arcade_torch import ArcadeCollector, from_jax
 from arcade_torch.agents import PQNLoss
 from arcade_torch.models import MemoryModule, make_memory
+from arcade_torch.policies import random_actions
 from arcade_torch.rollout_buffer import final_key
-from tests.arcade_torch.test_from_jax import N, few_envs, made
+from tests.arcade_torch.test_from_jax import N, NewWalk, Params, SixWalk, Walk, few_envs, made
 
 T = 10
 
@@ -141,6 +144,51 @@ def test_random_actions_are_those_that_the_spec_allows() -> None:
         assert actions.dtype is env.action_spec.dtype
         assert env.action_spec.unsqueeze(1).expand(N, 50, *actions.shape[2:]).is_in(actions)
         assert actions.unique().numel() >= 3
+
+
+@pytest.mark.parametrize(
+    ("dtype", "low", "high"),
+    [
+        (torch.uint8, 0, 255),
+        (torch.int8, -128, 127),
+        (torch.int8, -100, 100),
+        (torch.int32, -(2**31), 2**31 - 1),
+        (torch.float16, -60000.0, 60000.0),
+        (torch.float32, -3.4e38, 3.4e38),
+    ],
+)
+def test_random_actions_reach_over_the_whole_range_of_a_type(
+    dtype: torch.dtype, low: float, high: float
+) -> None:
+    """The distance of such bounds is no number of the type: bytes were 0, every time."""
+    spec = Bounded(low, high, shape=(1000,), dtype=dtype)
+    actions = random_actions(spec, torch.Generator().manual_seed(0))
+    assert actions.dtype is dtype and spec.is_in(actions)
+    numbers = actions.double()
+    eighth = (spec.space.high.double() - spec.space.low.double())[0] / 8
+    assert numbers.min() < low + eighth and numbers.max() > high - eighth
+
+
+class Cut(SixWalk):
+    """Truncated after three steps, though its params name a limit of eight."""
+
+    def step_env(self, key: jax.Array, state: Any, action: jax.Array, params: Params) -> Any:
+        state = self.move(key, state, action)
+        return self.look(state), state, 0.0, False, state["time"] >= 3, {}
+
+
+@pytest.mark.parametrize(("kind", "limit"), [(NewWalk, 50), (SixWalk, 50), (Cut, None)])
+def test_an_env_may_truncate_before_the_limit_that_is_counted_here(
+    kind: type[Walk], limit: int | None
+) -> None:
+    """Windows had places for the truncations at the limit alone, and stopped at any other."""
+    env = from_jax(kind(), Params(goal=10**6), N, max_steps=limit)
+    batch = ArcadeCollector(env, None, N * 40, final_frames="truncated").collect()
+    truncated = batch["next", "truncated"].squeeze(-1)
+    assert truncated[:, :-1].sum(1).min() >= 4
+    for row in range(N):
+        used = batch["final_index"][row][batch["final_mask"][row]].tolist()
+        assert used == sorted({*truncated[row].nonzero().flatten().tolist(), 39})
 
 
 def test_it_begins_anew_where_somebody_else_has_ended_episodes() -> None:
