@@ -19,7 +19,16 @@ from arcade_torch.agents import PQNLoss
 from arcade_torch.models import MemoryModule, make_memory
 from arcade_torch.policies import random_actions
 from arcade_torch.rollout_buffer import final_key
-from tests.arcade_torch.test_from_jax import N, NewWalk, Params, SixWalk, Walk, few_envs, made
+from tests.arcade_torch.test_from_jax import (
+    N,
+    NewWalk,
+    Params,
+    SixWalk,
+    Tree,
+    Walk,
+    few_envs,
+    made,
+)
 
 T = 10
 
@@ -189,6 +198,40 @@ def test_an_env_may_truncate_before_the_limit_that_is_counted_here(
     for row in range(N):
         used = batch["final_index"][row][batch["final_mask"][row]].tolist()
         assert used == sorted({*truncated[row].nonzero().flatten().tolist(), 39})
+
+
+class Named(Tree):
+    """Observes two arrays, one under a name that is given."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def tree(self, obs: jax.Array, state: jax.Array) -> Any:
+        return {"frame": obs, self.name: state}
+
+
+@pytest.mark.parametrize(
+    ("name", "mode"),
+    [
+        ("mask", "truncated"),
+        ("index", "none"),
+        ("final_frame", "truncated"),
+        ("initial_state", "all"),
+        ("collector", "all"),
+    ],
+)
+def test_observations_that_are_called_as_entries_of_a_batch_are_refused(
+    name: str, mode: Any
+) -> None:
+    """``final_mask`` took the place of the final ``mask``, the policy's state that of
+    ``initial_state``.
+    """
+    env = from_jax(Named(name), num_envs=N, max_steps=6)
+    with pytest.raises(ValueError, match=f"^the env observes '{name}', .*[^\n]*$"):
+        ArcadeCollector(env, None, N * T, final_frames=mode)
+    if mode != "all":
+        batch = ArcadeCollector(env, None, N * T, final_frames="all").collect()
+        assert batch[name].shape == batch["next", name].shape == (N, T, 2)
 
 
 def test_it_begins_anew_where_somebody_else_has_ended_episodes() -> None:
