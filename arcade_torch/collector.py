@@ -28,6 +28,7 @@ from arcade_torch.policies import (
 )
 from arcade_torch.process import warn
 from arcade_torch.rollout_buffer import Entry, FinalFrames, RolloutBuffer
+from arcade_torch.suite_actions import as_got
 from arcade_torch.validation import check_flags, whole
 
 
@@ -345,7 +346,8 @@ class ArcadeCollector(BaseCollector):
         following = dict(self._compressed(raw.observation))
         following.update(raw.root_numbers(reads))
         if "last_action" in reads:
-            following["last_action"] = action.to(self.env.action_spec.dtype, copy=True)
+            last_action = as_got(action)
+            following["last_action"] = last_action.to(self.env.action_spec.dtype, copy=True)
         if "task" in reads and isinstance(self.env, ArcadeEnv) and self.env.task_in_td:
             following["task"] = self.env.task
         return following

@@ -23,6 +23,7 @@ from tests.arcade_torch.test_from_jax import (
     N,
     NewWalk,
     Params,
+    Plain,
     SixWalk,
     Tree,
     Walk,
@@ -176,6 +177,24 @@ def test_random_actions_reach_over_the_whole_range_of_a_type(
     numbers = actions.double()
     eighth = (spec.space.high.double() - spec.space.low.double())[0] / 8
     assert numbers.min() < low + eighth and numbers.max() > high - eighth
+
+
+def test_last_actions_of_double_precision_are_what_the_env_got() -> None:
+    """JAX computes with float32: a reset, or a root, showed the rounded action, and the step before
+    it the action as it was given.
+    """
+    spec = Bounded(-1, 1, shape=(N, 2), dtype=torch.float64)
+
+    def act(td: TensorDictBase) -> TensorDictBase:
+        return td.set("action", torch.sin(td["step_count"] + td["last_action"] + 0.1))
+
+    env = from_jax(Plain(), num_envs=N, max_steps=6, action_spec=spec)
+    rollout = env.rollout(2 * T + 3, act, break_when_any_done=False)
+    assert torch.equal(rollout["next", "last_action"][:, :-1], rollout["last_action"][:, 1:])
+    assert torch.equal(rollout["next", "last_action"], rollout["action"].float().double())
+    collector = ArcadeCollector(env, act, N * T, 2 * N * T, seed=0, overlap=3)
+    batch = torch.cat([batch.clone() for batch in collector], 1)
+    assert not different(batch.exclude("collector"), rollout[:, 3:])
 
 
 class Cut(SixWalk):
