@@ -28,6 +28,7 @@ from arcade_torch.policies import (
 )
 from arcade_torch.process import warn
 from arcade_torch.rollout_buffer import Entry, FinalFrames, RolloutBuffer
+from arcade_torch.suite_actions import as_got
 from arcade_torch.validation import check_flags, whole
 
 
@@ -293,7 +294,9 @@ class ArcadeCollector(BaseCollector):
         for key in env.observation_keys:
             observation[key] = Entry(tuple(obs[key].shape[1:]), obs[key].dtype)
         of_games = isinstance(env, ArcadeEnv)
-        limits = [game.max_steps for game in env.games] if of_games else [env.max_steps or 1]
+        limits = (
+            [game.max_steps for game in env.games] if of_games else [env.least_steps_to_truncation]
+        )
         return RolloutBuffer(
             self._num_envs,
             self._overlap,
@@ -343,7 +346,8 @@ class ArcadeCollector(BaseCollector):
         following = dict(self._compressed(raw.observation))
         following.update(raw.root_numbers(reads))
         if "last_action" in reads:
-            following["last_action"] = action.to(self.env.action_spec.dtype, copy=True)
+            last_action = as_got(action)
+            following["last_action"] = last_action.to(self.env.action_spec.dtype, copy=True)
         if "task" in reads and isinstance(self.env, ArcadeEnv) and self.env.task_in_td:
             following["task"] = self.env.task
         return following

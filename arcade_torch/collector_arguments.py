@@ -9,8 +9,11 @@ from torchrl.envs.utils import ExplorationType
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.jax_env import JaxEnv
+from arcade_torch.policies import path_of
 from arcade_torch.rollout_buffer import FinalFrames
 from arcade_torch.validation import whole
+
+_PLACES = ("final_mask", "final_index")
 
 
 def _parameters(policy: Any) -> Collection[str]:
@@ -89,6 +92,28 @@ def check_arguments(
             f"final_frames is {final_frames!r}, allowed: "
             f"{', '.join(map(repr, get_args(FinalFrames)))}"
         )
+    _check_names({path_of(key)[0] for key in env.observation_keys}, final_frames)
     if compress is not None and len(env.observation_keys) > 1:
         names = ", ".join(map(str, env.observation_keys))
         raise ValueError(f"compress takes one array, and the env observes several: {names}")
+
+
+def _check_names(names: Collection[str], final_frames: str) -> None:
+    """Refuse observations that are called as other entries of a batch: one would take the place of
+    the other.
+    """
+    for name in ("collector", "initial_state"):
+        if name in names:
+            raise ValueError(
+                f"the env observes {name!r}, which is an entry of every batch: give it another name"
+            )
+    if final_frames == "all":
+        return
+    finals = {f"final_{name}" for name in names}
+    for name in sorted(names):
+        if name in finals or name in _PLACES or f"final_{name}" in _PLACES:
+            raise ValueError(
+                f"the env observes {name!r}, and final observations stand under final_KEY, their "
+                "places under final_mask and final_index: give it another name, or collect with "
+                "final_frames='all'"
+            )

@@ -121,6 +121,11 @@ class JaxEnv(BaseEnv):
         """The time limit that is counted here; None where there is none, or the suite counts."""
         return self.suite.max_steps
 
+    @property
+    def least_steps_to_truncation(self) -> int:
+        """So many steps of an env lie between two truncations at least."""
+        return 1 if self.suite.truncates_itself else self.max_steps or 1
+
     def __repr__(self) -> str:
         """Env, number and device."""
         return (
@@ -420,7 +425,8 @@ class JaxEnv(BaseEnv):
         truncated = to_torch(outcome.truncated, self.device).unsqueeze(-1).clone()
         step_count = to_torch(after.step_count, self.device).to(torch.int64)
         entries = self._observation(after.obs)
-        entries["last_action"] = action.to(self.action_spec.dtype, copy=True)
+        last_action = suite_actions.as_got(action)
+        entries["last_action"] = last_action.to(self.action_spec.dtype, copy=True)
         entries["is_init"] = torch.zeros_like(terminated)
         entries["step_count"] = step_count.unsqueeze(-1)
         episode_reward = to_torch(after.episode_reward, self.device)

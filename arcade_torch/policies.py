@@ -174,16 +174,14 @@ def random_actions(spec: TensorSpec, generator: torch.Generator) -> torch.Tensor
         return torch.randint(spec.space.n, shape, generator=generator, device=device)
     if not isinstance(spec, Bounded):
         return torch.randn(shape, generator=generator, device=device, dtype=spec.dtype)
-    low: torch.Tensor = spec.space.low
-    distance = spec.space.high - low
-    is_float = spec.dtype.is_floating_point
-    share = torch.rand(
-        shape, generator=generator, device=device, dtype=spec.dtype if is_float else torch.float64
-    )
-    action: torch.Tensor = (
-        low + share * distance if is_float else low + (share * (distance + 1)).to(spec.dtype)
-    )
-    return action
+    # the distance of two numbers of a type may be too large for the type
+    low: torch.Tensor = spec.space.low.to(torch.float64)
+    distance: torch.Tensor = spec.space.high.to(torch.float64) - low
+    if not spec.dtype.is_floating_point:
+        share = torch.rand(shape, generator=generator, device=device, dtype=torch.float64)
+        return (low + (share * (distance + 1)).floor()).to(spec.dtype)
+    share = torch.rand(shape, generator=generator, device=device, dtype=spec.dtype)
+    return (low + share * distance).to(spec.dtype)
 
 
 def copy_weights(policy: nn.Module, given: nn.Module | TensorDictBase | Mapping[str, Any]) -> None:

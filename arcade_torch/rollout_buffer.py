@@ -23,6 +23,7 @@ from arcade_torch.dlpack import is_host, upload
 from arcade_torch.frame_memory import Canvas, Reused, draws_in_place
 from arcade_torch.policies import path_of
 from arcade_torch.raw_step import Place
+from arcade_torch.suite_actions import as_got
 
 FinalFrames = Literal["all", "truncated", "none"]
 
@@ -285,7 +286,7 @@ class RolloutBuffer:
         after = slice(first + 1, self.length)
         done = self.done[:, before]
         numbers = self._numbers[:, before]
-        self._last_action[:, after] = self._action[:, before]
+        self._last_action[:, after] = as_got(self._action[:, before])
         self._root["is_init"][:, after] = done
         step_count = numbers[..., STEP_COUNT].to(torch.int64)
         self._root["step_count"][:, after] = step_count.masked_fill(done, 0)
@@ -382,7 +383,7 @@ class RolloutBuffer:
         for key in ("done", "terminated", "truncated", ("next", "is_init")):
             out[key] = torch.zeros((*size, 1), dtype=torch.bool, device=self.device)
         # copies, for either may be written to
-        out["next", "last_action"] = out["action"].clone()
+        out["next", "last_action"] = as_got(out["action"]).clone()
         if self._task is not None:
             out["next", "task"] = out["task"].clone()
         if not compact and self._dense is not None:

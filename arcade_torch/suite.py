@@ -54,6 +54,8 @@ class Suite:
         if max_steps is None and not self.tells_truncation:
             max_steps = _limit_of(params)
         self.max_steps = max_steps
+        # whether truncations may come before max_steps; the trace of a step shows both flags
+        self.truncates_itself = self.tells_truncation
 
     def reset(self, key: jax.Array) -> tuple[Any, Any]:
         """The first observation and state of an episode."""
@@ -137,6 +139,7 @@ class Suite:
         """
         is_limit = jnp.bool_(False) if self.max_steps is None else count >= self.max_steps
         if len(flags) == 2:
+            self.truncates_itself = True
             return flags[0], jnp.logical_or(flags[1], is_limit)
         if self.tells_truncation:
             truncated = self._number(self.env.is_truncated(after, *self.extra))

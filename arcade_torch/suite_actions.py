@@ -79,6 +79,11 @@ def check_action(action: Any, spec: TensorSpec, check_range: bool) -> None:
         )
 
 
+def as_got(action: torch.Tensor) -> torch.Tensor:
+    """Actions as the env gets them: floats have the precision of float32."""
+    return action.float().double() if action.dtype is torch.float64 else action
+
+
 def _check_spec(spec: TensorSpec, num_envs: int) -> None:
     """Refuse a spec whose actions nobody could hand to the env."""
     # subclasses of Categorical, such as OneHot and MultiCategorical, are another thing

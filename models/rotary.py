@@ -45,8 +45,8 @@ def rotate(x: Tensor, cosine: Tensor, sine: Tensor) -> Tensor:
 
     Returns:
         [..., W]: first the first channels of all pairs, then the second ones, then what is left
-        over. The order does not matter to a product of two rotated vectors, which is all that
-        rotated vectors are for.
+        over. The order does not matter to a product of two rotated vectors; a matrix that rotated
+        vectors are multiplied by, as in TTT, has its axis in this order.
     """
     turned = 2 * cosine.shape[-1]
     first = x[..., 0:turned:2]

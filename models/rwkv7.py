@@ -29,8 +29,9 @@ class RWKV7(Memory):
     the one before, x + mu (x_before - x), with a mu for each. S is the transpose of the paper's.
 
     One head of side K and no other block, because a network here has its own. Differs from the
-    paper by plain linear maps where it has low-rank ones (K is small already), and by the value of
-    the first layer, which later layers look at there. Sequential in time: the loop is one operator,
+    paper by plain linear maps where it has low-rank ones (K is small already), so that w lacks the
+    tanh between two maps and g has its sigmoid behind the map, and by the value of the first
+    layer, which later layers look at there. Sequential in time: the loop is one operator,
     with first derivatives only.
 
     The state is ``"h"`` [K, K] and ``"x"`` [D], the input before.

@@ -25,7 +25,9 @@ class TTTLinear(FastWeights):
 
     The state ``"h"`` [K, K] is (W_t - W_0)^T: zeros at the start of an episode, so that an env's
     reset, a primer and a stale buffer need not know W_0, and its gradient does not end where a
-    state was stored. ``"step"`` int64 [] counts the steps of the episode.
+    state was stored. ``start`` is W_0^T. The key axis of both is in the order of
+    :func:`~arcade_torch.models.rotary.rotate`: first the first channels of all pairs that turn,
+    then the second ones. ``"step"`` int64 [] counts the steps of the episode.
 
     The paper names neither eta nor W_0, the width or a normalisation, and its code has no such
     model: this is our own variant.

@@ -4,19 +4,32 @@ and what others do to the env.
 
 from typing import Any
 
+import jax
 import pytest
 import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
+from torchrl.data import Bounded
 from torchrl.envs import TransformedEnv
 
-from arcade_torch import ArcadeCollector
+from arcade_torch import ArcadeCollector, from_jax
 from arcade_torch.agents import PQNLoss
 from arcade_torch.models import MemoryModule, make_memory
+from arcade_torch.policies import random_actions
 from arcade_torch.rollout_buffer import final_key
-from tests.arcade_torch.test_from_jax import N, few_envs, made
+from tests.arcade_torch.test_from_jax import (
+    N,
+    NewWalk,
+    Params,
+    Plain,
+    SixWalk,
+    Tree,
+    Walk,
+    few_envs,
+    made,
+)
 
 T = 10
 
@@ -141,6 +154,103 @@ def test_random_actions_are_those_that_the_spec_allows() -> None:
         assert actions.dtype is env.action_spec.dtype
         assert env.action_spec.unsqueeze(1).expand(N, 50, *actions.shape[2:]).is_in(actions)
         assert actions.unique().numel() >= 3
+
+
+@pytest.mark.parametrize(
+    ("dtype", "low", "high"),
+    [
+        (torch.uint8, 0, 255),
+        (torch.int8, -128, 127),
+        (torch.int8, -100, 100),
+        (torch.int32, -(2**31), 2**31 - 1),
+        (torch.float16, -60000.0, 60000.0),
+        (torch.float32, -3.4e38, 3.4e38),
+    ],
+)
+def test_random_actions_reach_over_the_whole_range_of_a_type(
+    dtype: torch.dtype, low: float, high: float
+) -> None:
+    """The distance of such bounds is no number of the type: bytes were 0, every time."""
+    spec = Bounded(low, high, shape=(1000,), dtype=dtype)
+    actions = random_actions(spec, torch.Generator().manual_seed(0))
+    assert actions.dtype is dtype and spec.is_in(actions)
+    numbers = actions.double()
+    eighth = (spec.space.high.double() - spec.space.low.double())[0] / 8
+    assert numbers.min() < low + eighth and numbers.max() > high - eighth
+
+
+def test_last_actions_of_double_precision_are_what_the_env_got() -> None:
+    """JAX computes with float32: a reset, or a root, showed the rounded action, and the step before
+    it the action as it was given.
+    """
+    spec = Bounded(-1, 1, shape=(N, 2), dtype=torch.float64)
+
+    def act(td: TensorDictBase) -> TensorDictBase:
+        return td.set("action", torch.sin(td["step_count"] + td["last_action"] + 0.1))
+
+    env = from_jax(Plain(), num_envs=N, max_steps=6, action_spec=spec)
+    rollout = env.rollout(2 * T + 3, act, break_when_any_done=False)
+    assert torch.equal(rollout["next", "last_action"][:, :-1], rollout["last_action"][:, 1:])
+    assert torch.equal(rollout["next", "last_action"], rollout["action"].float().double())
+    collector = ArcadeCollector(env, act, N * T, 2 * N * T, seed=0, overlap=3)
+    batch = torch.cat([batch.clone() for batch in collector], 1)
+    assert not different(batch.exclude("collector"), rollout[:, 3:])
+
+
+class Cut(SixWalk):
+    """Truncated after three steps, though its params name a limit of eight."""
+
+    def step_env(self, key: jax.Array, state: Any, action: jax.Array, params: Params) -> Any:
+        state = self.move(key, state, action)
+        return self.look(state), state, 0.0, False, state["time"] >= 3, {}
+
+
+@pytest.mark.parametrize(("kind", "limit"), [(NewWalk, 50), (SixWalk, 50), (Cut, None)])
+def test_an_env_may_truncate_before_the_limit_that_is_counted_here(
+    kind: type[Walk], limit: int | None
+) -> None:
+    """Windows had places for the truncations at the limit alone, and stopped at any other."""
+    env = from_jax(kind(), Params(goal=10**6), N, max_steps=limit)
+    batch = ArcadeCollector(env, None, N * 40, final_frames="truncated").collect()
+    truncated = batch["next", "truncated"].squeeze(-1)
+    assert truncated[:, :-1].sum(1).min() >= 4
+    for row in range(N):
+        used = batch["final_index"][row][batch["final_mask"][row]].tolist()
+        assert used == sorted({*truncated[row].nonzero().flatten().tolist(), 39})
+
+
+class Named(Tree):
+    """Observes two arrays, one under a name that is given."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    def tree(self, obs: jax.Array, state: jax.Array) -> Any:
+        return {"frame": obs, self.name: state}
+
+
+@pytest.mark.parametrize(
+    ("name", "mode"),
+    [
+        ("mask", "truncated"),
+        ("index", "none"),
+        ("final_frame", "truncated"),
+        ("initial_state", "all"),
+        ("collector", "all"),
+    ],
+)
+def test_observations_that_are_called_as_entries_of_a_batch_are_refused(
+    name: str, mode: Any
+) -> None:
+    """``final_mask`` took the place of the final ``mask``, the policy's state that of
+    ``initial_state``.
+    """
+    env = from_jax(Named(name), num_envs=N, max_steps=6)
+    with pytest.raises(ValueError, match=f"^the env observes '{name}', .*[^\n]*$"):
+        ArcadeCollector(env, None, N * T, final_frames=mode)
+    if mode != "all":
+        batch = ArcadeCollector(env, None, N * T, final_frames="all").collect()
+        assert batch[name].shape == batch["next", name].shape == (N, T, 2)
 
 
 def test_it_begins_anew_where_somebody_else_has_ended_episodes() -> None:
