@@ -94,6 +94,16 @@ def test_a_flat_sequence_may_have_them_too(make):
 
 
 @LOSSES
+def test_start_flags_of_sequences_may_have_no_last_dimension_of_one(make):
+    batch = with_two_states(stream(4, 6, seed=5)).sequences()
+    batch["action_log_prob"] = torch.full((4, 6), -1.6)
+    expected = value(make(), batch.clone())
+    assert batch["is_init"].shape == (4, 6, 1)
+    batch["is_init"] = batch["is_init"].squeeze(-1)
+    assert torch.equal(value(make(), batch), expected)
+
+
+@LOSSES
 @pytest.mark.parametrize("dtype", [torch.int32, torch.uint8, torch.float32])
 def test_numbers_of_actions_may_be_of_any_dtype(make, dtype):
     other = changed("action", lambda x: x.to(dtype))
