@@ -50,7 +50,7 @@ def is_stock(batch: TensorDictBase, is_init: Key = "is_init") -> bool:
         raise ValueError(
             f"time must be the last dimension of a batch, [..., L]: transpose it; got {names}"
         )
-    return batch.ndim != 1 or flags.ndim == 2
+    return batch.ndim != 1 or flags.shape == (*batch.shape, 1)
 
 
 def step_mask(batch: TensorDictBase, shape: torch.Size) -> Tensor | None:
@@ -102,6 +102,17 @@ def check_module(network: Any) -> None:
             f"a network must be a TensorDict module; got {kind_of(network)}: "
             "TensorDictModule(network, [what it reads], [what it writes])"
         )
+
+
+def written(steps: TensorDictBase, key: Key, network: TensorDictModuleBase) -> Tensor:
+    """What a network has written under a key; a KeyError if it has not."""
+    value = steps.get(key, None)
+    if value is None:
+        raise KeyError(
+            f"the network does not write {key!r}, it writes {list(network.out_keys)}: name the "
+            "entry with set_keys, or let it write that"
+        )
+    return value  # type: ignore[no-any-return]
 
 
 def check_state_keys(network: TensorDictModuleBase) -> None:

@@ -25,6 +25,7 @@ from arcade_torch.agents.batch_checks import (
     flat,
     is_stock,
     step_mask,
+    written,
 )
 from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
@@ -288,8 +289,6 @@ def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs, bu
                 f"{', '.join(map(str, first.keys()))}"
             )
         out["initial_state"] = first.select(*inputs.state_keys).detach()
-        if burn_in and not inputs.reads_first_state_only:
-            _begin_with(out["burn_in"], first, inputs)
         return
 
     missing = [key for key in inputs.state_keys if key not in batch]
@@ -353,7 +352,7 @@ def unroll(
             for t in range(burn_in.shape[1]):
                 step = _with_state(burn_in[:, t], state, inputs)
                 state = network(step).get("next").select(*inputs.state_keys)
-            state = _with_state(extended[:, 0], state, inputs).select(*inputs.state_keys)
+            state = _loaded_at_start(extended[:, 0], state, inputs)
     if isinstance(network, MemoryNetwork) and network.store == "sequence" and key in network.heads:
         # the same without a TensorDict in between
         return network.read_sequences(extended, state)[key]
@@ -362,17 +361,6 @@ def unroll(
         _begin_with(extended, state, inputs)
     with set_recurrent_mode(True):
         return written(network(extended), key, network)
-
-
-def written(steps: TensorDictBase, key: Key, network: TensorDictModuleBase) -> Tensor:
-    """What a network has written under a key; a KeyError if it has not."""
-    value = steps.get(key, None)
-    if value is None:
-        raise KeyError(
-            f"the network does not write {key!r}, it writes {list(network.out_keys)}: name the "
-            "entry with set_keys, or let it write that"
-        )
-    return value  # type: ignore[no-any-return]
 
 
 def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> TensorDictBase:
@@ -396,11 +384,11 @@ def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> Tensor
         out[key] = entry(batch, key)
     if inputs.state_keys:
         _begin_with(out, batch["initial_state"], inputs)
-    return out
+    return _with_flags(out, inputs)
 
 
 def _with_flags(batch: TensorDictBase, inputs: NetworkInputs) -> TensorDictBase:
-    """The stock batch with start flags [*, L, 1], as memories read them."""
+    """The batch with start flags [*, L, 1], as memories read them."""
     for key in inputs.start_keys:
         flags = batch.get(key, None)
         if flags is not None and (flags.shape == batch.shape or flags.dtype != torch.bool):
@@ -411,17 +399,29 @@ def _with_flags(batch: TensorDictBase, inputs: NetworkInputs) -> TensorDictBase:
 def _with_state(
     step: TensorDictBase, state: TensorDictBase | None, inputs: NetworkInputs
 ) -> TensorDictBase:
-    """A step [B] that goes on from a state [B]; memories that store every step load what is stored
-    at a start.
+    """A step [B] that goes on from a state [B]. At a start it has the state that is stored there;
+    where none is, the network begins anew by itself, as when it acted.
     """
     step = step.copy()
+    if state is None:
+        return step
+    if any(key in step for key in inputs.state_keys):
+        state = _loaded_at_start(step, state, inputs)
+        for key in inputs.start_keys:
+            if key in step:
+                step[key] = torch.zeros_like(step[key])  # which would drop what was loaded
+    return step.update(state)
+
+
+def _loaded_at_start(
+    step: TensorDictBase, state: TensorDictBase, inputs: NetworkInputs
+) -> TensorDictBase:
+    """A state [B], but where a step [B] begins something that which is stored there, else zeros."""
     starts = [key for key in inputs.start_keys if key in step]
-    if state is not None and not inputs.reads_first_state_only and starts:
-        stored = state.clone().zero_().update(step.select(*inputs.state_keys, strict=False))
-        state = stored.where(step[starts[0]].squeeze(-1), state)
-        for key in starts:
-            step[key] = torch.zeros_like(step[key])  # which would drop what was loaded
-    return step if state is None else step.update(state)
+    if inputs.reads_first_state_only or not starts:
+        return state
+    stored = state.clone().zero_().update(step.select(*inputs.state_keys, strict=False))
+    return stored.where(step[starts[0]].squeeze(-1), state)
 
 
 def _begin_with(sequences: TensorDictBase, state: TensorDictBase, inputs: NetworkInputs) -> None:

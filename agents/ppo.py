@@ -25,12 +25,13 @@ from arcade_torch.agents.batch_checks import (
     step_mask,
     stored_numbers,
     with_mask,
+    written,
 )
 from arcade_torch.agents.checked import Finite, Positive, coerce, require
 from arcade_torch.agents.config import PPOConfig, TimeLimit
-from arcade_torch.agents.layout import NetworkInputs, as_steps, written
+from arcade_torch.agents.layout import NetworkInputs, as_steps
 from arcade_torch.agents.learner import Learner, Training
-from arcade_torch.agents.network_loss import NetworkLoss, Reduction, check_actor
+from arcade_torch.agents.network_loss import NetworkLoss, Reduction, check_actor, entropy_of
 from arcade_torch.agents.policy import make_actor
 from arcade_torch.agents.returns import SequenceGAE
 from arcade_torch.envs_jax.validation import plain
@@ -313,7 +314,7 @@ class PPOLoss(NetworkLoss):
             value_target=given[keys.value_target],
             clip_epsilon=self.clip_epsilon,
         )
-        entropy = one_a_step("entropy of the policy", policy.entropy(), steps)
+        entropy = one_a_step("entropy of the policy", entropy_of(policy), steps)
 
         losses = {
             "loss_objective": terms["policy_loss"],

@@ -14,7 +14,7 @@ from torch.nn import functional as F
 from arcade_torch.models.arguments import check_sizes, is_whole
 from arcade_torch.models.encoders import Encoder
 from arcade_torch.models.memory import batch_shape, first_state, replay
-from arcade_torch.models.recurrence import Key, Recurrence, Store
+from arcade_torch.models.recurrence import Key, Recurrence, Store, padding_mask
 from arcade_torch.models.registry import make_memory
 
 if TYPE_CHECKING:
@@ -54,6 +54,14 @@ def _check_one_a_step(name: str, kind: str, value: Any, lead: Sequence[int]) -> 
             return
         given = f"{value.dtype} {list(value.shape)}"
     raise ValueError(f"{name} must be {kind} {list(lead)}, one a step, got {given}")
+
+
+def _mean_of_steps(values: Tensor, mask: Tensor | None) -> Tensor:
+    """The mean [E] of numbers [..., T, E] over the steps that a mask [..., T, 1] counts."""
+    if mask is None:
+        return values.flatten(0, -2).mean(0)
+    count = mask.sum().clamp_min(1)
+    return values.where(mask, 0).flatten(0, -2).sum(0) / count
 
 
 class MemoryBlock(nn.Module):
@@ -302,7 +310,8 @@ class MemoryNetwork(TensorDictModuleBase):
             x = self._append(x, tensordict["last_action"], is_init)
         y = self.recurrence.read(self.block, tensordict, x)
         if self.predictor is not None and self.recurrence.recurrent_mode:
-            tensordict.set("prediction_error", self.prediction_error(x, y, is_init))
+            mask = padding_mask(tensordict, tensordict.batch_size)
+            tensordict.set("prediction_error", self.prediction_error(x, y, is_init, mask))
         for name, value in self.by_head(self.head(y)).items():
             tensordict.set(name, value)
         return tensordict
@@ -385,7 +394,9 @@ class MemoryNetwork(TensorDictModuleBase):
         out, _ = self.remember(features, last_action, is_init, first)
         return self.by_head(out)
 
-    def prediction_error(self, x: Tensor, y: Tensor, is_init: Tensor) -> Tensor:
+    def prediction_error(
+        self, x: Tensor, y: Tensor, is_init: Tensor, mask: Tensor | None = None
+    ) -> Tensor:
         """How far each next frame's features, as deviations from the batch's, are from those
         expected before it.
 
@@ -393,6 +404,7 @@ class MemoryNetwork(TensorDictModuleBase):
             x: float [..., T, E + num_actions], what the block read.
             y: float [..., T, H], what it gave.
             is_init: bool [..., T], True where an episode begins.
+            mask: bool [..., T], False where a step is padding; None: nowhere.
 
         Returns:
             float [..., T, 1], mean square; 0 where no frame of the episode follows. Targets get no
@@ -403,12 +415,16 @@ class MemoryNetwork(TensorDictModuleBase):
         size = self.encoder.feature_size
         following = x[..., 1:, :size].detach()
         action = x[..., 1:, size:]
-        centred = following - following.flatten(0, -2).mean(0)
-        deviation = centred.square().flatten(0, -2).mean(0).sqrt()
+        nothing_follows = is_init[..., 1:, None]
+        if mask is not None:
+            mask = mask[..., 1:, None]
+            nothing_follows = nothing_follows | ~mask
+        centred = following - _mean_of_steps(following, mask)
+        deviation = _mean_of_steps(centred.square(), mask).sqrt()
         target = centred / (deviation + 0.01)  # some features hardly ever change
         expected = self.predictor(torch.cat([y[..., :-1, :], action], dim=-1))  # type: ignore[misc]
         error = (expected - target).square().mean(-1, keepdim=True)
-        return F.pad(error.masked_fill(is_init[..., 1:, None], 0.0), (0, 0, 0, 1))
+        return F.pad(error.masked_fill(nothing_follows, 0.0), (0, 0, 0, 1))
 
     def initial_state(self, batch_size: int | Sequence[int]) -> TensorDict:
         """The block's state at the start of an episode, TensorDict [batch_size]; dtype and device

@@ -18,7 +18,7 @@ from arcade_torch.models.memory import first_state, replay
 if TYPE_CHECKING:
     from torchrl.envs import TensorDictPrimer
 
-__all__ = ["Key", "Recurrence", "SequenceChecks", "Store"]
+__all__ = ["Key", "Recurrence", "SequenceChecks", "Store", "padding_mask"]
 
 Key = str | tuple[str, ...]
 Store = Literal["step", "sequence"]
@@ -344,11 +344,20 @@ def _no_ends(tensordict: TensorDictBase, shape: torch.Size) -> Tensor | bool:
     done = _entry(tensordict, "done", shape)
     if done is not None:
         goes_on = ~done[..., :-1]
+    mask = padding_mask(tensordict, shape)
+    if mask is not None:
+        goes_on = goes_on & mask[..., 1:] & mask[..., :-1]
+    return goes_on
+
+
+def padding_mask(tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
+    """Which steps are no padding, bool [*, T]; None if the batch does not say."""
+    counted = None
     for key in ("mask", ("collector", "mask")):
         mask = _entry(tensordict, key, shape)
         if mask is not None and mask.dtype == torch.bool:
-            goes_on = goes_on & mask[..., 1:] & mask[..., :-1]
-    return goes_on
+            counted = mask if counted is None else counted & mask
+    return counted
 
 
 def _numbers(tensordict: TensorDictBase, shape: torch.Size) -> dict[str, tuple[Tensor, Tensor]]:

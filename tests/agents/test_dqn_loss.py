@@ -2,9 +2,10 @@
 
 import pytest
 import torch
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictModuleBase, TensorDictSequential
 from torch import nn
-from torchrl.modules import GRUModule
+from torchrl.modules import GRUModule, recurrent_mode
 
 from arcade_torch.agents import DQNConfig, DQNLoss
 from arcade_torch.agents.learner import epsilon_at
@@ -114,6 +115,40 @@ def test_nothing_of_the_episode_before_comes_through_a_burn_in(kind, start):
         before = slice(0, min(start, 3))
         s.pixels[:, before] = 255 - s.pixels[:, before]
     assert torch.equal(*found) == (start <= 3)
+
+
+class BeginsWithOnes(TensorDictModuleBase):
+    """A sum over the episode that begins with one, whatever is stored; nothing of ours."""
+
+    in_keys = ["pixels", "h", "is_init"]  # noqa: RUF012
+    out_keys = ["action_value", ("next", "h")]  # noqa: RUF012
+
+    def __init__(self):
+        super().__init__()
+        self.read = nn.Linear(12, ACTIONS)
+
+    def forward(self, tensordict):
+        x = self.read(tensordict["pixels"].flatten(-3) / 255)
+        if not recurrent_mode():
+            x = x.unsqueeze(1)
+        flags = tensordict["is_init"].reshape(x.shape[:2])
+        h = tensordict["h"].reshape(*x.shape[:2], ACTIONS)[:, 0]
+        states = []
+        for t in range(x.shape[1]):
+            h = torch.where(flags[:, t, None], 1.0, h) + x[:, t]
+            states.append(h)
+        states = torch.stack(states, 1).reshape(*tensordict.shape, ACTIONS)
+        return tensordict.update({"action_value": states, "next": {"h": states}})
+
+
+def test_a_burn_in_begins_an_episode_as_the_network_does_where_no_states_are_stored():
+    s = stream(2, 8, seed=1, ends=0.0)
+    s.is_init[:], s.is_init[:, 1] = False, True
+    s.state = TensorDict({"h": torch.ones(2, ACTIONS)}, [2])
+    network = BeginsWithOnes()
+    found = look_into(make_loss(network, burn_in=3), s.sequences())
+    whole = look_into(make_loss(network), s.sequences())
+    torch.testing.assert_close(found[0], whole[0][:, 3:])
 
 
 @pytest.mark.parametrize("burn_in", [0, 2])

@@ -17,6 +17,7 @@ from torchrl.modules import PopArtValueNorm
 from arcade_torch.agents import DQNLoss, PPOLoss, PQNLoss, make_actor
 from arcade_torch.models import MemoryModule, make_memory
 from tests.agents.fakes import (
+    ACTIONS,
     GAMMA,
     LAM,
     WIDTH,
@@ -90,6 +91,16 @@ def test_a_flat_sequence_may_have_them_too(make):
     for key in ("action", "action_log_prob"):
         row[key] = row[key].unsqueeze(-1)
     assert torch.equal(value(make(), row), expected)
+
+
+@LOSSES
+def test_start_flags_of_sequences_may_have_no_last_dimension_of_one(make):
+    batch = with_two_states(stream(4, 6, seed=5)).sequences()
+    batch["action_log_prob"] = torch.full((4, 6), -1.6)
+    expected = value(make(), batch.clone())
+    assert batch["is_init"].shape == (4, 6, 1)
+    batch["is_init"] = batch["is_init"].squeeze(-1)
+    assert torch.equal(value(make(), batch), expected)
 
 
 @LOSSES
@@ -311,6 +322,21 @@ def test_padding_is_no_part_of_loss_or_gradient(make, key):
         found.append((value(loss, form), gradients))
     for other in found[1:]:
         torch.testing.assert_close(other, found[0], atol=1e-5, rtol=1e-5)
+
+
+def test_padding_is_no_part_of_what_is_predicted():
+    network = toy_actor_critic()
+    network.actor.predictor = nn.Linear(WIDTH + ACTIONS, WIDTH)
+    loss = PPOLoss(make_actor(network.actor), network.critic, prediction_coeff=1.0)
+    rows = loss.value_estimator(ppo_batch(steps=6, ends=0.0))
+    behind = rows[:, :2].clone()
+    behind["is_init"] = torch.zeros_like(behind["is_init"])
+    mask = torch.ones(4, 6, dtype=torch.bool)
+    padded_rows = torch.cat([rows, behind], 1)
+    padded_rows["collector", "mask"] = torch.cat([mask, ~mask[:, :2]], 1)
+    assert (padded_rows[:, 6:]["pixels"] != 0).any()
+    wanted = loss(rows)["loss_prediction"]
+    torch.testing.assert_close(loss(padded_rows)["loss_prediction"], wanted)
 
 
 @LOSSES

@@ -4,7 +4,14 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
-from torchrl.modules import ActorValueOperator, LSTMModule, ProbabilisticActor, ValueOperator
+from torchrl.modules import (
+    ActorValueOperator,
+    LSTMModule,
+    NormalParamExtractor,
+    ProbabilisticActor,
+    TanhNormal,
+    ValueOperator,
+)
 
 from arcade_torch.agents import DQNLoss, PPOLoss, PQNLoss, make_actor
 from tests.agents.fakes import toy_actor_critic, toy_network
@@ -106,3 +113,27 @@ def test_two_memories_under_one_key_are_refused():
     lstm = [LSTMModule(3, 3, in_key="x", out_key="y") for _ in range(2)]
     with pytest.raises(ValueError, match="got two with their state under 'recurrent_state_h'"):
         PQNLoss(TensorDictSequential(*lstm))
+
+
+def test_a_policy_without_a_formula_of_its_entropy_gets_an_estimate():
+    """``TanhNormal`` of TorchRL for one."""
+    torch.manual_seed(0)
+    network = head(4, "numbers")
+    with torch.no_grad():
+        for parameter in network.parameters():
+            parameter.mul_(0.003)  # frames are numbers up to 255
+    extract = TensorDictModule(NormalParamExtractor(), ["numbers"], ["loc", "scale"])
+    keys = {"in_keys": ["loc", "scale"], "return_log_prob": True}
+    actor = ProbabilisticActor(
+        TensorDictSequential(network, extract), distribution_class=TanhNormal, **keys
+    )
+    loss = PPOLoss(actor, head(1, "state_value"))
+    batch = ppo_batch()
+    batch["action"] = torch.rand(4, 4, 2) - 0.5
+    with torch.no_grad():
+        many = loss.actor_network.get_dist(batch.clone())
+        wanted = -many.log_prob(many.sample((4000,))).mean()
+        found = torch.stack([loss(batch)["entropy"] for _ in range(200)])
+    assert abs(found.mean() - wanted) < 4 * found.std() / 200**0.5 + 0.02
+    gradients = torch.autograd.grad(loss(batch)["loss_entropy"], list(network.parameters()))
+    assert any(bool(gradient.any()) for gradient in gradients)

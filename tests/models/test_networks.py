@@ -161,6 +161,34 @@ def test_the_frame_that_is_predicted_gets_no_gradient_and_those_before_it_do():
     assert reached[4] == 0 and (reached[:4] > 0).all()
 
 
+def test_padding_is_never_predicted_and_no_part_of_the_batchs_deviation():
+    """``split_trajectories`` fills rows up, with zeros that begin no episode."""
+    network = predicting("lru", predicts=True)
+    pixels, last_action, is_init = inputs(3, 6)
+    is_init[:, 4:] = False
+    entries = {"pixels": pixels, "last_action": last_action, "is_init": is_init.unsqueeze(-1)}
+    batch = TensorDict(entries, [3, 6])
+    mask = torch.arange(6) < torch.tensor([[4], [4], [4]])
+    with torch.no_grad(), set_recurrent_mode(True):
+        wanted = F.pad(network(batch[:, :4].clone())["prediction_error"], (0, 0, 0, 2))
+        for key in ("mask", ("collector", "mask")):
+            found = network(batch.clone().set(key, mask))["prediction_error"]
+            torch.testing.assert_close(found, wanted)
+
+
+def test_a_batch_of_single_steps_and_padding_has_nothing_to_predict():
+    network = predicting("lru", predicts=True)
+    pixels, last_action, _ = inputs(2, 3)
+    flags, mask = torch.zeros(2, 3, 1, dtype=torch.bool), torch.zeros(2, 3, dtype=torch.bool)
+    mask[:, 0] = True
+    entries = {"pixels": pixels, "last_action": last_action, "is_init": flags, "mask": mask}
+    with set_recurrent_mode(True):
+        error = network(TensorDict(entries, [2, 3]))["prediction_error"]
+    error.mean().backward()
+    assert not error.any()
+    assert not any(p.grad.any() for p in network.parameters() if p.grad is not None)
+
+
 def test_a_step_predicts_nothing_and_of_two_towers_the_actor_does():
     network = predicting("lru", predicts=True)
     flags, frame = torch.ones(2, 1, dtype=torch.bool), torch.zeros(2, 32, 32, 3, dtype=torch.uint8)
