@@ -184,7 +184,7 @@ class Noise:
         frames = disturbed_frames(window.frames, places, self.sigmas, self.clip, seed, white)
         noisy = policy.features(frames)
         features = clean.repeat(len(noisy), 1, 1)
-        features[torch.arange(len(noisy)), places.repeat(len(self.sigmas))] = noisy
+        features[np.arange(len(noisy)), places.repeat(len(self.sigmas))] = noisy
         return Versions(features, places, int(places.min()))
 
 
@@ -201,7 +201,7 @@ class Shuffle:
     ) -> Versions:
         """Permute early frames of a window, whose features are ``clean``."""
         order = shuffle_order(window.n + 1, FIRST, LAST, rng)
-        return Versions(clean[torch.as_tensor(order)][None], np.array([LAST]), FIRST)
+        return Versions(clean[torch.from_numpy(order)][None], np.array([LAST]), FIRST)
 
 
 class Changes(NamedTuple):
@@ -299,9 +299,9 @@ class Disturber:
 
 def _compare(model: Any, target: str, raw: Tensor, decisions: Ints) -> Changes:
     """Compare rows 1... with row 0 at steps [points, 1, K]; the changes are [points, S, K]."""
-    rows = torch.arange(1, len(raw)).reshape(len(decisions), -1, 1)
-    reached = torch.as_tensor(decisions < raw.shape[1])
-    steps = torch.as_tensor(decisions).clamp(max=raw.shape[1] - 1)
+    rows = np.arange(1, len(raw)).reshape(len(decisions), -1, 1)
+    reached = torch.from_numpy(decisions < raw.shape[1])
+    steps = np.minimum(decisions, raw.shape[1] - 1)
     clean = raw[0, steps]
     disturbed = raw[rows, steps]
     scalars = outputs(model, target)
@@ -381,7 +381,7 @@ def contamination_example(
     order = np.tile(np.arange(n + 1), (1 + len(hits), 1))
     if shuffle:
         order[1] = shuffle_order(n + 1, FIRST, LAST, np.random.default_rng(seed))
-    versions = w.frames[torch.as_tensor(order)].to(float_type(w.frames))
+    versions = w.frames[torch.from_numpy(order)].to(float_type(w.frames))
     white = white_of(w.frames, policy.white)
     if not shuffle:
         versions[range(1, len(order)), hits] = disturbed_frames(
@@ -403,10 +403,12 @@ def disturbed_frames(
     """Single frames with Gaussian noise, floats [places * sigmas, ...]; the strengths of one frame
     share its draw, and 1 stands for ``white``.
     """
-    generator = torch.Generator().manual_seed(seed)
-    chosen = frames[torch.as_tensor(places)].to(float_type(frames))
-    noise = torch.randn(chosen.shape, generator=generator).to(chosen)
-    scale = torch.as_tensor(white * sigmas).to(chosen).reshape(-1, *[1] * (frames.ndim - 1))
+    generator = torch.Generator("cpu").manual_seed(seed)
+    chosen = frames[torch.from_numpy(places)].to(float_type(frames))
+    # the same draw whatever torch's default type and device are
+    noise = torch.randn(chosen.shape, generator=generator, dtype=torch.float32, device="cpu")
+    noise = noise.to(chosen)
+    scale = torch.from_numpy(white * sigmas).to(chosen).reshape(-1, *[1] * (frames.ndim - 1))
     noisy = (chosen[:, None] + scale * noise[:, None]).flatten(0, 1)
     return noisy.clamp(0.0, white) if clip else noisy
 

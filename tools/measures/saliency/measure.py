@@ -102,7 +102,7 @@ def saliency(
         TypeError: ``model`` has none of the forms above.
     """
     policy = as_policy(model, **names)
-    frames = torch.as_tensor(frames)
+    frames = frames if isinstance(frames, Tensor) else torch.as_tensor(frames)
     _check_options(reduce, norm, chunk, resolve(policy, target), dtype)
     dtype = dtype or float_type(frames)
     steps = _index(n, frames) + 1
