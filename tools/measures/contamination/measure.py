@@ -401,15 +401,13 @@ def disturbed_frames(
     frames: Tensor, places: Ints, sigmas: Array, clip: bool, seed: int, white: float = 255.0
 ) -> Tensor:
     """Single frames with Gaussian noise, floats [places * sigmas, ...]; the strengths of one frame
-    share its draw, and 1 stands for ``white``.
+    share its draw, which no default of torch changes, and 1 stands for ``white``.
     """
     generator = torch.Generator("cpu").manual_seed(seed)
     chosen = frames[torch.from_numpy(places)].to(float_type(frames))
-    # the same draw whatever torch's default type and device are
     noise = torch.randn(chosen.shape, generator=generator, dtype=torch.float32, device="cpu")
-    noise = noise.to(chosen)
     scale = torch.from_numpy(white * sigmas).to(chosen).reshape(-1, *[1] * (frames.ndim - 1))
-    noisy = (chosen[:, None] + scale * noise[:, None]).flatten(0, 1)
+    noisy = (chosen[:, None] + scale * noise.to(chosen)[:, None]).flatten(0, 1)
     return noisy.clamp(0.0, white) if clip else noisy
 
 
