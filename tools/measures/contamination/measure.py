@@ -24,18 +24,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arcade_torch.tools.measures import arguments
+from arcade_torch.tools.measures import arguments, masked
 from arcade_torch.tools.measures.bootstrap import Array
 from arcade_torch.tools.measures.envs import one_hot
 from arcade_torch.tools.measures.frames import float_type, pictures, white_of
 from arcade_torch.tools.measures.keys import Names
-from arcade_torch.tools.measures.masked import (
-    centred,
-    differences,
-    divergence,
-    refuse_nan,
-    span,
-)
 from arcade_torch.tools.measures.policy import (
     Policy,
     Progress,
@@ -273,7 +266,7 @@ class Disturber:
         middle = window.n // 2
         features[middle] = self.policy.features(window.frames[middle : middle + 1])[0]
         again = replayed(self.policy, window, features[None], changed, self.feedback)
-        return float(differences(again, raw).max())
+        return float(masked.differences(again, raw).max())
 
     def result(self) -> Contamination:
         """All changes; a ``ValueError`` if there is none."""
@@ -308,15 +301,19 @@ def _compare(model: Any, target: str, raw: Tensor, decisions: Ints) -> Changes:
     before = scalars(clean).double().cpu()
     after = scalars(disturbed).double().cpu()
     flip = (before.argmax(-1) != after.argmax(-1)).double()
-    a, b = centred(before.expand_as(after), after)
-    spread = span(a)
-    change = torch.where(spread > 0, (b - a).abs().nan_to_num(0.0).amax(-1) / spread, torch.nan)
+    before = before.expand_as(after)
     kl = torch.full_like(flip, torch.nan)
     if target in ("logits", "probs"):
         logits = outputs(model, "logits")
-        p = logits(clean).double().cpu().log_softmax(-1)
+        p = logits(clean).double().cpu().log_softmax(-1).expand_as(after)
         q = logits(disturbed).double().cpu().log_softmax(-1)
-        kl = divergence(p.expand_as(q), q)
+        kl = masked.divergence(p, q)
+        # a probability of 0 that stays 0 is an action that is masked out
+        before = masked.hidden(before, p, q)
+        after = masked.hidden(after, p, q)
+    a, b = masked.centred(before, after)
+    spread = masked.span(a)
+    change = torch.where(spread > 0, (b - a).abs().nan_to_num(0.0).amax(-1) / spread, torch.nan)
 
     def where_reached(values: Tensor) -> Array:
         return np.asarray(torch.where(reached, values, torch.nan).numpy())
@@ -391,7 +388,7 @@ def contamination_example(
         features = policy.features(versions.flatten(0, 1)).unflatten(0, order.shape)
         raw = replayed(policy, w, features, FIRST, feedback)[:, -1]
         values = outputs(player, output)(raw).double().cpu()
-    values = values if output == "probs" else centred(values, values)[0]
+    values = values if output == "probs" else masked.centred(values, values)[0]
     drawn = pictures(versions.flatten(0, 1), policy.channels, white)
     drawn = drawn.reshape(*order.shape, *drawn.shape[1:])
     return Example(drawn, order, np.array([-1, *hits]), values.numpy(), output, sigma)
@@ -437,13 +434,13 @@ def replayed(
     actions = window.last_action.expand(count, *window.last_action.shape)
     starts = window.is_init.bool().expand(count, -1)
     out, state = policy.remember(features[:, :begin], actions[:, :begin], starts[:, :begin], state)
-    refuse_nan(out)
+    masked.refuse_nan(out)
     parts = [out]
     for t in range(begin, features.shape[1]):
         action = policy.greedy(out[:, -1:])
         if actions.ndim == 3:
             action = one_hot(action, actions.shape[-1]).to(actions)
         out, state = policy.remember(features[:, t : t + 1], action, starts[:, t : t + 1], state)
-        refuse_nan(out)
+        masked.refuse_nan(out)
         parts.append(out)
     return torch.cat(parts, 1)
