@@ -60,9 +60,9 @@ class EpisodeBatch:
         """
         self.env.set_seed(seed)
         self._root = self.env.reset()
-        nothing = torch.zeros(self.size, dtype=torch.int64)
+        nothing = torch.zeros(self.size, dtype=torch.int64, device="cpu")
         before = torch.zeros_like(self._encode(nothing))  # no action, one-hot: all zeros
-        begins = torch.ones(self.size, 1, dtype=torch.bool)
+        begins = torch.ones(self.size, 1, dtype=torch.bool, device="cpu")
         return self._observe(before, begins)
 
     def step(self, action: Tensor) -> tuple[TensorDictBase, Tensor, Tensor]:

@@ -92,7 +92,7 @@ def pictures(
     One channel is grey, three are red, green and blue, and of any other number every channel has a
     colour, the brightest in front. Vectors are a row of grey cells.
     """
-    values = torch.as_tensor(frames)
+    values = torch.as_tensor(frames, device="cpu")
     axis = channel_axis(values.shape[-3:], channels) if values.ndim > 3 else None
     if values.dtype == torch.uint8 and axis == -1 and values.shape[-1] == 3:
         return np.asarray(values.cpu().numpy())

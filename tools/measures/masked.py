@@ -60,6 +60,15 @@ def are_near(values: Tensor, others: Tensor, share: float) -> bool:
     return float(differences(values.double(), others.double()).norm()) <= share * float(size)
 
 
+def hidden(values: Tensor, p: Tensor, q: Tensor) -> Tensor:
+    """Outputs [..., A] with minus infinity for actions whose logarithms of probabilities are so in
+    two situations, ``p`` and ``q``; where a single action has any probability nothing is hidden.
+    """
+    is_out = (p == -torch.inf) & (q == -torch.inf)
+    is_choice = (~is_out).sum(-1, keepdim=True) > 1
+    return torch.where(is_out & is_choice, -torch.inf, values)
+
+
 def centred(values: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
     """Outputs of actions [..., A] in two situations, minus their means; NaN for actions that are
     masked out in one of them.

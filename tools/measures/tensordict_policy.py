@@ -1,11 +1,11 @@
 """A TensorDict policy as the two functions that the measures ask for.
 
-The modules of a policy are sorted once, by their keys. Those that read nothing but frames are the
-encoder, which sees every frame once. The rest, memory and heads, reads sequences from a recurrent
-state that is handed to it: our ``MemoryModule`` and TorchRL's ``LSTMModule`` and ``GRUModule`` in
-one call, any other module with a state step by step, as it acts, and so do modules together that
-pass a state on to one another. A policy that reads frames and state in one module cannot be cut in
-two; its features are the frames.
+The modules of a policy are sorted once, by their keys. Those before the heads that read nothing but
+frames are the encoder, which sees every frame once. The rest, memory and heads, reads sequences
+from a recurrent state that is handed to it: our ``MemoryModule`` and TorchRL's ``LSTMModule`` and
+``GRUModule`` in one call, any other module with a state step by step, as it acts, and so do modules
+together that pass a state on to one another. A policy that reads frames and state in one module
+cannot be cut in two; its features are the frames.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -85,10 +85,20 @@ class TensorDictPolicy:
     def _split(
         self, needed: Sequence[TensorDictModuleBase]
     ) -> tuple[list[TensorDictModuleBase], list[TensorDictModuleBase]]:
-        """The modules that see nothing but frames, and those behind them."""
+        """The modules that see nothing but frames, and those behind them: heads are behind, with
+        memory or without, unless they read the frames themselves.
+        """
+        heads = set(self.output.keys)
+        encoder, rest = self._split_before(needed, heads)
+        return (encoder, rest) if encoder else self._split_before(needed, set())
+
+    def _split_before(
+        self, needed: Sequence[TensorDictModuleBase], heads: set[Key]
+    ) -> tuple[list[TensorDictModuleBase], list[TensorDictModuleBase]]:
+        """`_split`, with what writes one of ``heads`` behind the encoder."""
         visible = {self.keys.pixels}
         # by what stands behind the encoder; a state that is written in its place belongs there
-        touched = {key for key, after in self.state_keys.items() if key == after}
+        touched = heads | {key for key, after in self.state_keys.items() if key == after}
         encoder = list[TensorDictModuleBase]()
         rest = list[TensorDictModuleBase]()
         for part in needed:

@@ -201,14 +201,14 @@ def play(
     """
     episodes = EpisodeBatch(env, keys_of(agent), most)
     size = episodes.size
-    starts = torch.as_tensor([0] * size if first is None else first)
-    lengths = torch.zeros(size, dtype=torch.int64)
-    ended = torch.zeros(size, dtype=torch.bool)
+    starts = torch.tensor([0] * size if first is None else first, device="cpu")
+    lengths = torch.zeros(size, dtype=torch.int64, device="cpu")
+    ended = torch.zeros(size, dtype=torch.bool, device="cpu")
     obs = episodes.reset(seed)
     state = agent.initial_state(size)
     kept: TensorDictBase | None = None
     states: list[Any] = [None] * size
-    playing = torch.ones(size, dtype=torch.bool)
+    playing = torch.ones(size, dtype=torch.bool, device="cpu")
     t = 0
     while playing.any() and (max_steps is None or t < max_steps):
         if t == ENDLESS:

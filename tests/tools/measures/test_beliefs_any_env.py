@@ -178,3 +178,36 @@ def test_entries_behind_an_end_are_of_no_use() -> None:
     dirty = beliefs_of(recording(CLASSES, spoilt(STATES, np.nan, 5), lengths))
     np.testing.assert_array_equal(dirty.state_loss, clean.state_loss)
     assert replace(dirty).episodes == EPISODES
+
+
+class PresentCue(CueEnv):
+    """Names the cue in view."""
+
+    def _observe(self, count: Tensor) -> TensorDict:
+        after = super()._observe(count)
+        self.shown = after["cue"].argmax(-1)
+        return after
+
+    def facts(self) -> Mapping[str, Tensor]:
+        """The cue of the present step."""
+        return {"cue": self.shown}
+
+
+@pytest.mark.parametrize("has_chooser", [False, True])
+def test_features_of_a_policy_without_memory_are_not_its_outputs(has_chooser: bool) -> None:
+    """Before: a network without memory was all encoder, so that facts were read off its Q-values:
+    of four cues these told one from the others, though its features held all.
+    """
+    head = TensorDictModule(lambda features: features[..., :2], ["features"], ["action_value"])
+    parts = [TensorDictModule(lambda cue: 2 * cue, ["cue"], ["features"]), head]
+    if has_chooser:
+        choose = lambda values: values.argmax(-1)  # noqa: E731
+        parts.append(TensorDictModule(choose, ["action_value"], ["action"]))
+    policy = TensorDictSequential(*parts)
+    probes = beliefs(policy, PresentCue(), episodes=32)
+    assert probes.frame_width == CUES and probes.state_width == 0
+    assert probes.score("cue", "frame").value == 1
+    frames = torch.eye(CUES)[None]
+    wrapped = as_policy(policy)
+    assert wrapped.splits
+    assert torch.equal(wrapped.unroll(wrapped.features(frames[0])[None])[0], 2 * frames[..., :2])

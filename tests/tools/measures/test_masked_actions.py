@@ -12,6 +12,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor
+from torch.nn.functional import one_hot
 
 from arcade_torch.tools import Policy, contamination, counterfactual, recall_density, saliency
 from arcade_torch.tools.measures.masked import divergence
@@ -52,8 +53,7 @@ def test_an_action_that_is_masked_out_changes_no_measure(kind: str) -> None:
     )
     assert without.mean("flip")[0, 0] > 0.2
     np.testing.assert_array_equal(with_mask.flip, without.flip)
-    if kind != "probs":  # there the mean goes over one more action, which has 0
-        np.testing.assert_allclose(with_mask.change, without.change, rtol=1e-5)
+    np.testing.assert_allclose(with_mask.change, without.change, rtol=1e-5)
     np.testing.assert_allclose(with_mask.kl, without.kl, rtol=1e-5, atol=1e-9)
     assert np.isfinite(with_mask.kl).any() == (kind != "q")
     exchange = {"episodes": 6, "donors": 2, "target": target}
@@ -93,6 +93,20 @@ def test_a_probability_that_becomes_zero_has_a_large_divergence_and_no_infinite_
     same, large, half = divergence(p.log(), q.log()).tolist()
     assert same == 0 and half == pytest.approx(np.log(2))
     assert 50 < large < 60 and divergence(p.log(), p.log()).tolist() == [0, 0, 0]
+
+
+def test_of_probabilities_of_one_the_change_is_the_flip() -> None:
+    """An action that alone has a probability, before and after, is no decision without others."""
+    policy = linear_policy(0.5, dtype=torch.float32, pixel_scale=255.0)
+
+    def remember(*read: Any) -> tuple[Tensor, Any]:
+        out, state = policy.remember(*read)
+        return one_hot(out.argmax(-1), ACTIONS).to(out).log(), state
+
+    sure = replace(policy, remember=remember, offers=("logits", "probs"), read=read_plain)
+    changes = contamination(sure, ToyEnv([6, 8]), sigmas=(1.0,), delays=(0, 1), starts=20)
+    assert 0 < changes.mean("flip")[0, 0] < 1
+    np.testing.assert_array_equal(changes.change, changes.flip)
 
 
 def test_the_logits_of_probabilities_of_zero_have_no_gradient() -> None:

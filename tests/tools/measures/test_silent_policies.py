@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -20,6 +21,7 @@ from arcade_torch.tools import (
     recall_density,
     saliency,
 )
+from arcade_torch.tools.measures.recall_density.measure import density_of_windows
 from tests.tools.measures.toys import SIZE, ToyEnv, linear_policy, window
 
 WIDTH = 8
@@ -226,6 +228,19 @@ def test_a_zero_at_a_kink_is_right() -> None:
 
     same = window(1).frames.expand(5, SIZE, SIZE, 3)
     assert saliency(Policy(encode, remember), same).shares().max() == 1
+
+
+@pytest.mark.parametrize("steps", [160, 250])
+@pytest.mark.parametrize("norm", ["l1", "l2", "l2sq"])
+def test_a_gradient_too_small_for_its_type_is_no_cut(steps: int, norm: Any) -> None:
+    """Before: a memory that forgets by halves was refused after some 130 steps, its gradients
+    being below what single precision holds.
+    """
+    policy = linear_policy(0.5, dtype=torch.float64)
+    shares = density_of_windows(policy, [window(steps)], norm=norm).shares[0]
+    halves = 0.25 if norm == "l2sq" else 0.5
+    wanted = halves ** np.arange(steps)[::-1] * (1 - halves)
+    np.testing.assert_allclose(shares, wanted, rtol=1e-5, atol=1e-30)
 
 
 def test_inference_mode_measures_what_is_measured_outside_of_it() -> None:

@@ -143,7 +143,7 @@ def _patch_batch(
 ) -> Ints:
     """The first episode of every env of a batch: own, donor's and patched actions [3, N, T]."""
     size = played.size
-    playing = torch.ones(size, dtype=torch.bool)
+    playing = torch.ones(size, dtype=torch.bool, device="cpu")
     steps = list[Ints]()
     obs = played.reset(seed)
     state = agent.initial_state(size)

@@ -100,7 +100,7 @@ def _record_batch(agent: Any, played: EpisodeBatch, seed: int, max_steps: int) -
     policy = policy_of(agent)
     size = played.size
     lengths = np.zeros(size, np.int64)
-    playing = torch.ones(size, dtype=torch.bool)
+    playing = torch.ones(size, dtype=torch.bool, device="cpu")
     steps = list[tuple[Floats, Floats, dict[str, NDArray[Any]]]]()
     obs = played.reset(seed)
     state = agent.initial_state(size)
@@ -133,7 +133,7 @@ def facts_of(played: EpisodeBatch) -> dict[str, NDArray[Any]]:
     """
     facts = dict[str, NDArray[Any]]()
     for name, value in played.env.facts().items():
-        values = torch.as_tensor(value).cpu().numpy().copy()
+        values = torch.as_tensor(value, device="cpu").numpy().copy()
         facts[name] = values if played.is_batch else values[None]
         require(
             facts[name].shape[:1] == (played.size,),

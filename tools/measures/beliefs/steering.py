@@ -248,7 +248,7 @@ def _steer_batch(
     """
     size = played.size
     count = len(directions.names)
-    playing = torch.ones(size, dtype=torch.bool)
+    playing = torch.ones(size, dtype=torch.bool, device="cpu")
     steps = list[Ints]()
     before = dict[str, NDArray[Any]]()  # facts of the step before
     obs = played.reset(seed)

@@ -24,18 +24,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arcade_torch.tools.measures import arguments
+from arcade_torch.tools.measures import arguments, masked
 from arcade_torch.tools.measures.bootstrap import Array
 from arcade_torch.tools.measures.envs import one_hot
 from arcade_torch.tools.measures.frames import float_type, pictures, white_of
 from arcade_torch.tools.measures.keys import Names
-from arcade_torch.tools.measures.masked import (
-    centred,
-    differences,
-    divergence,
-    refuse_nan,
-    span,
-)
 from arcade_torch.tools.measures.policy import (
     Policy,
     Progress,
@@ -184,7 +177,7 @@ class Noise:
         frames = disturbed_frames(window.frames, places, self.sigmas, self.clip, seed, white)
         noisy = policy.features(frames)
         features = clean.repeat(len(noisy), 1, 1)
-        features[torch.arange(len(noisy)), places.repeat(len(self.sigmas))] = noisy
+        features[np.arange(len(noisy)), places.repeat(len(self.sigmas))] = noisy
         return Versions(features, places, int(places.min()))
 
 
@@ -201,7 +194,7 @@ class Shuffle:
     ) -> Versions:
         """Permute early frames of a window, whose features are ``clean``."""
         order = shuffle_order(window.n + 1, FIRST, LAST, rng)
-        return Versions(clean[torch.as_tensor(order)][None], np.array([LAST]), FIRST)
+        return Versions(clean[torch.from_numpy(order)][None], np.array([LAST]), FIRST)
 
 
 class Changes(NamedTuple):
@@ -273,7 +266,7 @@ class Disturber:
         middle = window.n // 2
         features[middle] = self.policy.features(window.frames[middle : middle + 1])[0]
         again = replayed(self.policy, window, features[None], changed, self.feedback)
-        return float(differences(again, raw).max())
+        return float(masked.differences(again, raw).max())
 
     def result(self) -> Contamination:
         """All changes; a ``ValueError`` if there is none."""
@@ -299,24 +292,28 @@ class Disturber:
 
 def _compare(model: Any, target: str, raw: Tensor, decisions: Ints) -> Changes:
     """Compare rows 1... with row 0 at steps [points, 1, K]; the changes are [points, S, K]."""
-    rows = torch.arange(1, len(raw)).reshape(len(decisions), -1, 1)
-    reached = torch.as_tensor(decisions < raw.shape[1])
-    steps = torch.as_tensor(decisions).clamp(max=raw.shape[1] - 1)
+    rows = np.arange(1, len(raw)).reshape(len(decisions), -1, 1)
+    reached = torch.from_numpy(decisions < raw.shape[1])
+    steps = np.minimum(decisions, raw.shape[1] - 1)
     clean = raw[0, steps]
     disturbed = raw[rows, steps]
     scalars = outputs(model, target)
     before = scalars(clean).double().cpu()
     after = scalars(disturbed).double().cpu()
     flip = (before.argmax(-1) != after.argmax(-1)).double()
-    a, b = centred(before.expand_as(after), after)
-    spread = span(a)
-    change = torch.where(spread > 0, (b - a).abs().nan_to_num(0.0).amax(-1) / spread, torch.nan)
+    before = before.expand_as(after)
     kl = torch.full_like(flip, torch.nan)
     if target in ("logits", "probs"):
         logits = outputs(model, "logits")
-        p = logits(clean).double().cpu().log_softmax(-1)
+        p = logits(clean).double().cpu().log_softmax(-1).expand_as(after)
         q = logits(disturbed).double().cpu().log_softmax(-1)
-        kl = divergence(p.expand_as(q), q)
+        kl = masked.divergence(p, q)
+        # a probability of 0 that stays 0 is an action that is masked out
+        before = masked.hidden(before, p, q)
+        after = masked.hidden(after, p, q)
+    a, b = masked.centred(before, after)
+    spread = masked.span(a)
+    change = torch.where(spread > 0, (b - a).abs().nan_to_num(0.0).amax(-1) / spread, torch.nan)
 
     def where_reached(values: Tensor) -> Array:
         return np.asarray(torch.where(reached, values, torch.nan).numpy())
@@ -381,7 +378,7 @@ def contamination_example(
     order = np.tile(np.arange(n + 1), (1 + len(hits), 1))
     if shuffle:
         order[1] = shuffle_order(n + 1, FIRST, LAST, np.random.default_rng(seed))
-    versions = w.frames[torch.as_tensor(order)].to(float_type(w.frames))
+    versions = w.frames[torch.from_numpy(order)].to(float_type(w.frames))
     white = white_of(w.frames, policy.white)
     if not shuffle:
         versions[range(1, len(order)), hits] = disturbed_frames(
@@ -391,7 +388,7 @@ def contamination_example(
         features = policy.features(versions.flatten(0, 1)).unflatten(0, order.shape)
         raw = replayed(policy, w, features, FIRST, feedback)[:, -1]
         values = outputs(player, output)(raw).double().cpu()
-    values = values if output == "probs" else centred(values, values)[0]
+    values = values if output == "probs" else masked.centred(values, values)[0]
     drawn = pictures(versions.flatten(0, 1), policy.channels, white)
     drawn = drawn.reshape(*order.shape, *drawn.shape[1:])
     return Example(drawn, order, np.array([-1, *hits]), values.numpy(), output, sigma)
@@ -401,13 +398,13 @@ def disturbed_frames(
     frames: Tensor, places: Ints, sigmas: Array, clip: bool, seed: int, white: float = 255.0
 ) -> Tensor:
     """Single frames with Gaussian noise, floats [places * sigmas, ...]; the strengths of one frame
-    share its draw, and 1 stands for ``white``.
+    share its draw, which no default of torch changes, and 1 stands for ``white``.
     """
-    generator = torch.Generator().manual_seed(seed)
-    chosen = frames[torch.as_tensor(places)].to(float_type(frames))
-    noise = torch.randn(chosen.shape, generator=generator).to(chosen)
-    scale = torch.as_tensor(white * sigmas).to(chosen).reshape(-1, *[1] * (frames.ndim - 1))
-    noisy = (chosen[:, None] + scale * noise[:, None]).flatten(0, 1)
+    generator = torch.Generator("cpu").manual_seed(seed)
+    chosen = frames[torch.from_numpy(places)].to(float_type(frames))
+    noise = torch.randn(chosen.shape, generator=generator, dtype=torch.float32, device="cpu")
+    scale = torch.from_numpy(white * sigmas).to(chosen).reshape(-1, *[1] * (frames.ndim - 1))
+    noisy = (chosen[:, None] + scale * noise.to(chosen)[:, None]).flatten(0, 1)
     return noisy.clamp(0.0, white) if clip else noisy
 
 
@@ -437,13 +434,13 @@ def replayed(
     actions = window.last_action.expand(count, *window.last_action.shape)
     starts = window.is_init.bool().expand(count, -1)
     out, state = policy.remember(features[:, :begin], actions[:, :begin], starts[:, :begin], state)
-    refuse_nan(out)
+    masked.refuse_nan(out)
     parts = [out]
     for t in range(begin, features.shape[1]):
         action = policy.greedy(out[:, -1:])
         if actions.ndim == 3:
             action = one_hot(action, actions.shape[-1]).to(actions)
         out, state = policy.remember(features[:, t : t + 1], action, starts[:, t : t + 1], state)
-        refuse_nan(out)
+        masked.refuse_nan(out)
         parts.append(out)
     return torch.cat(parts, 1)

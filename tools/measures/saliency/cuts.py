@@ -34,8 +34,9 @@ def refuse_cuts(outputs_of: Callable[[Tensor], Tensor], inputs: Tensor, reached:
     if reached.all():
         return
     inputs = inputs.detach()
-    generator = torch.Generator().manual_seed(0)
-    nudge = torch.rand(inputs.shape, generator=generator).to(inputs) * inputs.abs().mean() * NUDGE
+    generator = torch.Generator("cpu").manual_seed(0)
+    nudge = torch.rand(inputs.shape, generator=generator, dtype=torch.float32, device="cpu")
+    nudge = nudge.to(inputs) * inputs.abs().mean() * NUDGE
     nudge[reached] = 0
     values = outputs_of(inputs)
     size = values.nan_to_num(posinf=0.0, neginf=0.0).abs().max()

@@ -121,7 +121,7 @@ def saliency(
         maps, sums = _frame_norms(policy, frames, jacobian, norm, chunk, dtype)
     return Saliency(
         maps=maps.float().cpu().numpy(),
-        per_frame=sums.double().cpu().numpy(),
+        per_frame=sums.cpu().numpy(),
         output=values.float().cpu().numpy(),
         n=steps - 1,
         target=resolve(policy, target),
@@ -157,6 +157,8 @@ def _index(n: int, frames: Tensor) -> int:
 
 def _tensor(name: str, values: Any) -> Tensor:
     """A tensor as it is, and one of an array or a list of numbers."""
+    if isinstance(values, Tensor):  # which `as_tensor` moves to torch's default device
+        return values
     try:
         return torch.as_tensor(values)
     except (TypeError, ValueError, RuntimeError) as error:
@@ -255,20 +257,26 @@ def _frame_norms(
         axes = [1 if axis == 0 else 3]
         shape.pop(axes[0])
     per_pixel = jacobian.new_zeros(shape, dtype=dtype)
-    per_frame = jacobian.new_zeros(len(frames), dtype=dtype)
+    per_frame = jacobian.new_zeros(len(frames), dtype=torch.float64)
     needed = jacobian.ne(0).any(-1).any(0).nonzero().squeeze(-1)
     for index in needed.split(chunk) if len(needed) else ():
         part = frames[index].to(dtype).requires_grad_()
         features = policy.encode(part)
         reached = torch.zeros_like(index, dtype=torch.bool)
         for row in jacobian[:, index].to(features):
-            gradient = _gradient(features, part, row)
+            # each frame's row as one of size 1: a small one vanishes in the product, and is no cut
+            size = row.abs().amax(1, keepdim=True)
+            gradient = _gradient(features, part, row / torch.where(size > 0, size, 1))
             reached |= gradient.ne(0).flatten(1).any(1)
             pixels = gradient.abs() if norm == "l1" else gradient.square()
             pixels = pixels.sum(axes) if axes else pixels
-            total = pixels.flatten(1).sum(1)
-            per_frame[index] += total.sqrt() if norm == "l2" else total
-            per_pixel[index] += pixels.sqrt() if norm == "l2" else pixels
+            total = pixels.flatten(1).sum(1, dtype=torch.float64)
+            if norm == "l2":
+                pixels = pixels.sqrt()
+                total = total.sqrt()
+            factor = size.squeeze(1).double() ** (2 if norm == "l2sq" else 1)
+            per_frame[index] += total * factor
+            per_pixel[index] += pixels * factor.to(dtype).reshape(-1, *[1] * (pixels.ndim - 1))
         refuse_cuts(policy.encode, part, reached)
     refuse_infinite(per_frame)
     return per_pixel, per_frame
