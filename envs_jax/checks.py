@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import MEMORY_KINDS, NUM_ACTIONS, ORACLES, Game, keeps_ends
 from arcade_torch.envs_jax.settings import compiled
-from arcade_torch.envs_jax.tracing import check_array, check_same, leaves, traced
+from arcade_torch.envs_jax.tracing import check_array, check_same, kind_of_traced, leaves, traced
 from arcade_torch.envs_jax.validation import kind_of
 
 _OURS = "arcade_torch.envs_jax."
@@ -53,7 +53,7 @@ def check_game(game: Game[Any], play: bool = False) -> None:
         raise ValueError(f"{name}: reset gives None, wanted a state: a tree of arrays")
     stepped = traced(name, "step", game.step, key, first, jax.ShapeDtypeStruct((), jnp.int32))
     if not isinstance(stepped, tuple) or len(stepped) != 4:
-        got = f"{len(stepped)} values" if isinstance(stepped, tuple) else kind_of(stepped)
+        got = f"{len(stepped)} values" if isinstance(stepped, tuple) else kind_of_traced(stepped)
         raise ValueError(
             f"{name}: step gives {got}, wanted 4: state, reward, terminated, truncated (a tuple)"
         )
@@ -72,7 +72,7 @@ def _check_facts(name: str, facts: Any) -> None:
     """Refuse facts that are no dictionary of arrays of booleans, integers or float32."""
     if not isinstance(facts, dict):
         raise ValueError(
-            f"{name}: facts gives {kind_of(facts)}, wanted a dictionary of arrays by name"
+            f"{name}: facts gives {kind_of_traced(facts)}, wanted a dictionary of arrays by name"
         )
     for fact, value in facts.items():
         if not isinstance(fact, str) or not fact or "." in fact:

@@ -100,6 +100,11 @@ def _is_equal(one: Any, other: Any) -> bool:
     return bool(as_numpy(one).tobytes() == as_numpy(other).tobytes())
 
 
+def kind_of_traced(value: Any) -> str:
+    """What ``kind_of`` says of a value; an array that is known by its shape alone is one."""
+    return "an array" if hasattr(value, "dtype") else kind_of(value)
+
+
 def check_array(name: str, subject: str, value: Any, shape: tuple[int, ...], dtype: str) -> None:
     """Raise ValueError for anything but an array of this shape and type."""
     if not hasattr(value, "shape"):
@@ -120,11 +125,10 @@ def check_same(name: str, subject: str, first: Any, following: Any) -> None:
         raise ValueError(f"{name}: reset gives {with_article(subject)} without any array")
     before: object = jax.tree.structure(first)
     if before != jax.tree.structure(following):
-        kind = "an array" if hasattr(first, "dtype") else f"{kind_of(first)}"
         raise ValueError(
             f"{name}: step gives {with_article(subject)} of another structure, with "
             f"{', '.join(theirs) or 'nothing'}; wanted that of "
-            f"reset, {kind} with {', '.join(ours)}"
+            f"reset, {kind_of_traced(first)} with {', '.join(ours)}"
         )
     for leaf, wanted in ours.items():
         place = subject if leaf == subject else f"{subject} entry {leaf}"

@@ -5,6 +5,7 @@ cannot run.
 import gc
 import importlib.util
 import os
+import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +29,10 @@ os.environ.pop("PYTHONUNBUFFERED", None)
 
 # What tests import is no choice of the user who runs them.
 os.environ["XDG_STATE_HOME"] = str(Path(__file__).resolve().parents[1] / ".pytest_cache" / "state")
+
+# A shell has what it starts in the background ignore Ctrl-C, and so would all that tests start.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Compilation makes the first example slow, and a red test has to stay red when it is run again.
 settings.register_profile(

@@ -117,7 +117,7 @@ WRONG = [
     ),
     (
         {"step": lambda s, key, state, action: state.count},
-        "step gives a ShapeDtypeStruct, wanted 4: state, reward",
+        "step gives an array, wanted 4: state, reward",
     ),
     (
         {"step": step_giving(state=lambda s: (s.count, s.seen))},

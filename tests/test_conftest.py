@@ -1,0 +1,20 @@
+"""What ``conftest.py`` sets for all tests."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+
+def test_ctrl_c_reaches_what_tests_start_in_the_background() -> None:
+    """A shell without job control has its background ignore Ctrl-C, and a program inherits that: a
+    study that a test interrupts went on to its end.
+    """
+    code = "import signal; import tests.conftest; print(signal.getsignal(signal.SIGINT).__name__)"
+    done = subprocess.run(
+        ["sh", "-c", 'trap \'\' INT; exec "$0" -c "$1"', sys.executable, code],
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.strip() == "default_int_handler", done
