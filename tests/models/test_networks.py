@@ -94,6 +94,37 @@ def test_the_residual_skip_lets_the_input_bypass_the_memory_and_none_does_not():
         torch.testing.assert_close(y, expected)
 
 
+@pytest.mark.parametrize("skip", ["residual", "none"])
+@torch.no_grad()
+def test_the_block_is_its_equation_layer_by_layer(skip):
+    block = MemoryBlock(3, 4, "gru", layers=2, skip=skip)
+    x, is_init = torch.randn(2, 5, 3), torch.rand(2, 5) < 0.3
+    state = block.initial_state([2])
+    y, after = block(x, state, is_init)
+    expected = block.linear(x)
+    for name, cell, linear in zip(block.names, block.cells, block.linears, strict=True):
+        read, state_after = cell(expected, state[name], is_init)
+        added = F.leaky_relu(F.layer_norm(linear(read), (4,)))
+        expected = expected + added if skip == "residual" else added
+        assert torch.equal(after[name, "h"], state_after["h"])
+    torch.testing.assert_close(y, expected)
+    stored = torch.stack([state] * 5, dim=1)
+    assert block.replay(x, stored, is_init)[1].batch_size == (2, 5)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        ({"input_size": 2.5}, "^input_size must be a whole number from 1, got 2.5$"),
+        ({"hidden_size": 0}, "^hidden_size must be a whole number from 1, got 0$"),
+        ({"layers": 0}, "^layers must be at least 1, got 0$"),
+    ],
+)
+def test_sizes_of_a_block_are_whole_numbers_from_one(sizes, message):
+    with pytest.raises(ValueError, match=message):
+        MemoryBlock(**{"input_size": 3, "hidden_size": 4, "memory": "gru"} | sizes)
+
+
 def last_action_matters(network, is_init):
     """Does the output at step 0 depend on the last action shown there?"""
     pixels, last_action, _ = inputs(1, 1)
