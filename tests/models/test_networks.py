@@ -7,7 +7,13 @@ from torch import nn
 from torch.nn import functional as F
 from torchrl.modules import set_recurrent_mode
 
-from arcade_torch.models import MemoryBlock, check_memory, make_actor_critic, make_network
+from arcade_torch.models import (
+    MemoryBlock,
+    MemoryNetwork,
+    check_memory,
+    make_actor_critic,
+    make_network,
+)
 from arcade_torch.models.presets import HEADS, make_head
 
 CELLS = {"lru": 1_050_624, "gru": 1_574_400, "mingru": 525_312, "mlp": 262_656}
@@ -342,6 +348,24 @@ def test_dtype_follows_the_parameters():
     pixels, last_action, is_init = inputs()
     out, state = run(network, pixels, last_action, is_init, network.initial_state(2))
     assert out.dtype == torch.float64 and state["layer0", "h"].dtype == torch.float64
+
+
+@torch.no_grad()
+def test_under_autocast_the_memory_reads_in_single_precision():
+    network = make_network("small", "gru", obs_size=32)
+    pixels, last_action, is_init = inputs(2, 4)
+    first = network.initial_state(2)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        features = network.encode(pixels).bfloat16()
+        _, state = network.remember(features, last_action, is_init, first)
+    _, expected = network.remember(features.float(), last_action, is_init, first)
+    assert (state == expected).all()
+
+
+def test_the_last_action_is_not_hidden_at_cuts():
+    block = MemoryBlock(8, 4, "gru")
+    with pytest.raises(ValueError, match=r"^zero_action_on_reset needs store='sequence'"):
+        MemoryNetwork(nn.Identity(), block, nn.Identity(), zero_action_on_reset=True, store="step")
 
 
 @pytest.mark.parametrize("memory", ["mingru", "lru"])
