@@ -351,6 +351,17 @@ def test_dtype_follows_the_parameters():
 
 
 @torch.no_grad()
+def test_sequences_need_neither_a_last_action_nor_a_state_that_nobody_reads():
+    network = make_network("small", "mlp", obs_size=32, use_last_action=False)
+    pixels, _, is_init = inputs(2, 4)
+    sequences = TensorDict({"pixels": pixels, "is_init": is_init.unsqueeze(-1)}, [2])
+    read = network.read_sequences(sequences, TensorDict({}, [2]))
+    with set_recurrent_mode(True):
+        written = network(sequences.auto_batch_size_(2))
+    torch.testing.assert_close(read["action_value"], written["action_value"])
+
+
+@torch.no_grad()
 def test_under_autocast_the_memory_reads_in_single_precision():
     network = make_network("small", "gru", obs_size=32)
     pixels, last_action, is_init = inputs(2, 4)
