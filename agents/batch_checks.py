@@ -40,8 +40,7 @@ def is_stock(batch: TensorDictBase, is_init: Key = "is_init") -> bool:
     ...]; refuse one without a step, or whose time is not its last dimension (ValueError).
     """
     flags = entry(batch, is_init)
-    is_empty = flags.numel() == 0 or batch.numel() == 0
-    if batch.ndim == 0 or is_empty:
+    if batch.ndim == 0 or flags.numel() == 0:
         raise ValueError(
             f"a batch must be [..., L] with L >= 1 steps; got batch_size {list(batch.shape)}"
         )

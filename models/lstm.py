@@ -81,7 +81,7 @@ class LSTM(Memory):
         """y [B, T, H] and the last state [B, 2, H] by ``torch.lstm``, which keeps no other c."""
         bias = self.from_input.bias
         weights = (self.from_input.weight, self.from_state.weight, bias, torch.zeros_like(bias))
-        state = h0.to(x.dtype).transpose(0, 1)
+        state = h0.transpose(0, 1)
         outputs = []
         for begin, end in pairwise([0, *starts, x.shape[1]]):
             h, c = torch.where(is_init[:, begin, None], 0, state).split(1)

@@ -85,9 +85,8 @@ class FramesOracle:
         # At first sight the ball is taken to make for the nearer wall; the second tells.
         guess = np.where(x * 2 >= COLUMNS, rules.UP_RIGHT, rules.UP_LEFT)
         wrong = visible & ((x != belief.ball_x) | (y != belief.ball_y))
-        turned = np.where(
-            is_init, guess, np.where(wrong, belief.ball_dir ^ rules.SIDEWAYS, belief.ball_dir)
-        )
+        seen_to_move = np.where(x > belief.last_x, rules.UP_RIGHT, rules.UP_LEFT)
+        turned = np.where(is_init, guess, np.where(wrong, seen_to_move, belief.ball_dir))
         self.belief = belief._replace(
             ball_x=np.where(visible, x, belief.ball_x).astype(np.int32),
             ball_y=np.where(visible, y, belief.ball_y).astype(np.int32),

@@ -188,6 +188,37 @@ def test_what_was_stored_is_no_way_for_a_gradient(make):
     assert all(p.grad is not None for p in loss.parameters())
 
 
+def ppo_sequences():
+    batch = with_two_states(stream(4, 4, seed=5)).sequences()
+    return batch.set("action_log_prob", ppo_batch()["action_log_prob"])
+
+
+@LOSSES
+def test_a_first_state_is_no_way_for_a_gradient(make):
+    batch = ppo_sequences()
+    first = batch["initial_state", "memory", "actor", "h"].clone().requires_grad_()
+    batch["initial_state", "memory", "actor", "h"] = first * 1.0
+    total(make()(batch)).backward()
+    assert first.grad is None
+
+
+@LOSSES
+@pytest.mark.parametrize("form", [ppo_batch, ppo_sequences])
+def test_a_batch_is_as_it_was_behind_a_loss(make, form):
+    """Also one that has to be read otherwise than it is written: flags of bytes, no truncated."""
+    batch = form()
+    for key in ("is_init", *[("next", name) for name in NEXTS[1:]]):
+        batch[key] = batch[key].to(torch.uint8)
+    del batch["next", "truncated"]
+    batch["mask"] = torch.ones(4, 4, dtype=torch.bool)
+    before = batch.clone()
+    make()(batch)
+    assert set(batch.keys(True)) - {"td_error"} == set(before.keys(True))
+    for key, given in before.items(True, True):
+        assert batch[key].dtype == given.dtype
+        assert torch.equal(batch[key].nan_to_num(7), given.nan_to_num(7)), key
+
+
 # -- names -------------------------------------------------------------------------------------------
 
 

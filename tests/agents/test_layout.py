@@ -140,15 +140,20 @@ def test_rows_of_the_layout_are_the_layout_of_the_rows(seed, steps, ends):
     assert (data[rows] == insert_final_observations(form_of(s, "sequences")[rows], inputs)).all()
 
 
+@pytest.mark.parametrize("form", ["stock", "all"])
 @pytest.mark.parametrize("burn_in", [0, 2, 5, 6])
-def test_a_memory_that_stores_every_step_starts_from_the_states_it_was_given(burn_in):
+def test_a_memory_that_stores_every_step_starts_from_the_states_it_was_given(burn_in, form):
     """``store="step"``: a sampler may have cut an episode, then the state stored at the cut counts,
     not zeros.
     """
     s, network = experience(1, 3, 8, 0.0, 0.0), hash_network("step")
     s.is_init[1, 5] = s.is_init[2, 0] = True
-    batch, states = s.stock(), torch.randint(1000, (3, 8, 1))
-    batch["memory", "h"] = states
+    batch, states = form_of(s, form), torch.randint(1000, (3, 8, 1))
+    if form == "stock":
+        batch["memory", "h"] = states
+    else:
+        states[:, 1:] = 0  # sequences have none of later steps
+        batch["initial_state", "memory", "h"] = states[:, 0]
     h, wanted = states[:, 0], []
     for t in range(8):
         h = torch.where(s.is_init[:, t, None], states[:, t], h)

@@ -246,6 +246,29 @@ def test_the_frames_of_the_pomdp_suffice_to_clear_the_wall():
     np.testing.assert_allclose(episodes.returns, 1.0, atol=1e-5)
 
 
+def test_two_frames_of_an_episode_tell_the_player_of_frames_all_there_is_to_know():
+    """Also beside a wall that the ball flies away from, and behind ends. Play is clumsy, so that
+    there are some.
+    """
+    game = make(HARD, random_start=True)
+    compiled = BatchedGame(game)
+    oracle, rng = make_oracle(game, "frames"), np.random.default_rng(0)
+    batch = compiled.init(env_keys(0, 64), jnp.ones(64, bool))
+    starts = 0
+    for _ in range(120):
+        state = jax.tree.map(np.asarray, batch.state)
+        begins = state.time == 0
+        starts += begins.sum()
+        action = oracle.act(np.asarray(compiled.render(batch)), begins)
+        for name in ("ball_x", "ball_y", "ball_dir", "pos", "bricks", "strike"):
+            believed = np.asarray(getattr(oracle.belief, name))
+            np.testing.assert_array_equal(believed[~begins], getattr(state, name)[~begins], name)
+        action = np.where(rng.random(64) < 0.3, rng.integers(0, 5, 64), action)
+        oracle.action = action.astype(np.int32)
+        batch = compiled.step_autoreset(batch, oracle.action)[0]
+    assert starts > 100
+
+
 def test_clumsy_play_pays_what_the_bricks_say():
     """A follower who moves at random 3 times in 10: whatever the path, the return is the bricks'
     worth and the loss.

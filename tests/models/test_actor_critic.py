@@ -116,6 +116,9 @@ def test_one_tower_gives_both_and_each_half_alone(memory):
         torch.testing.assert_close(value, out[:, 0, 5:])
     for half in (network.actor, network.critic, network.estimator):
         assert [id(p) for p in half.parameters()] == [id(p) for p in network.parameters()]
+    states = [key for key in network.actor.out_keys if key != "logits"]
+    assert states == [("next", *key) for key in network.actor.state_keys]
+    assert network.critic.out_keys == ["state_value", *states]
 
 
 def test_one_network_alone_needs_both_heads():

@@ -134,6 +134,22 @@ def problem(name, batch, steps, dtype, resets=0.03):
     return memory, x[:, :steps].clone(), state, flags
 
 
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("steps", [1, 3, 80])
+@torch.no_grad()
+def test_what_is_written_to_an_output_changes_no_state_and_no_input(name, steps):
+    memory, x, state, flags = problem(name, 2, steps, torch.float32)
+    y, after = memory(x, state, flags)
+    given = [x.clone(), state.clone(), after.clone()]
+    y.add_(1)
+    assert torch.equal(x, given[0])
+    assert (after == given[2]).all()
+    for leaf in after.values():
+        leaf.zero_()
+    assert torch.equal(x, given[0])
+    assert (state == given[1]).all()
+
+
 def assert_near(ours, theirs, dtype):
     """Equal to 1e-5 in float32 and 1e-12 in float64 of the largest number."""
     scale = float(theirs.abs().max().clamp_min(1e-3))

@@ -364,6 +364,11 @@ def test_features_of_more_than_one_vector_a_step_are_refused(sequences):
     message = r"x is \[2, .*5, 3\] in a batch of shape .*, expected one vector a step"
     with set_recurrent_mode(sequences), pytest.raises(ValueError, match=message):
         module(agents)
+    number = TensorDict({"seen": torch.ones(()), "is_init": flags[0].reshape(-1)[:1]}, [])
+    with pytest.raises(
+        ValueError, match=r"x is \[\] in a batch of shape \[\], expected one vector"
+    ):
+        module(number)
 
 
 @pytest.mark.parametrize("dtype", [torch.int64, torch.uint8, torch.float32])

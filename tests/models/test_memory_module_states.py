@@ -144,3 +144,11 @@ def test_wrong_use_gets_one_clear_line():
         module.begin_with(TensorDict({}, [2, 5]), TensorDict({}, [2]))
     with pytest.raises(KeyError, match=r"no 'is_init'.*InitTracker"):
         module(TensorDict({"x": torch.zeros(2, 3)}, [2]))
+
+
+def test_keys_may_be_nested_and_are_told_as_torchrl_writes_them():
+    module = MemoryModule(
+        make_memory("gru", 3, 4), ("seen",), ("out",), state_key=("policy", "memory")
+    )
+    assert module.in_keys == ["seen", ("policy", "memory", "h"), "is_init"]
+    assert module.out_keys == ["out", ("next", "policy", "memory", "h")]

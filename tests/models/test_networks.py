@@ -7,7 +7,13 @@ from torch import nn
 from torch.nn import functional as F
 from torchrl.modules import set_recurrent_mode
 
-from arcade_torch.models import MemoryBlock, check_memory, make_actor_critic, make_network
+from arcade_torch.models import (
+    MemoryBlock,
+    MemoryNetwork,
+    check_memory,
+    make_actor_critic,
+    make_network,
+)
 from arcade_torch.models.presets import HEADS, make_head
 
 CELLS = {"lru": 1_050_624, "gru": 1_574_400, "mingru": 525_312, "mlp": 262_656}
@@ -92,6 +98,37 @@ def test_the_residual_skip_lets_the_input_bypass_the_memory_and_none_does_not():
         y, _ = block(x, block.initial_state(2), flags)
         expected = block.linear(x) if skip == "residual" else torch.zeros(2, 4, 4)
         torch.testing.assert_close(y, expected)
+
+
+@pytest.mark.parametrize("skip", ["residual", "none"])
+@torch.no_grad()
+def test_the_block_is_its_equation_layer_by_layer(skip):
+    block = MemoryBlock(3, 4, "gru", layers=2, skip=skip)
+    x, is_init = torch.randn(2, 5, 3), torch.rand(2, 5) < 0.3
+    state = block.initial_state([2])
+    y, after = block(x, state, is_init)
+    expected = block.linear(x)
+    for name, cell, linear in zip(block.names, block.cells, block.linears, strict=True):
+        read, state_after = cell(expected, state[name], is_init)
+        added = F.leaky_relu(F.layer_norm(linear(read), (4,)))
+        expected = expected + added if skip == "residual" else added
+        assert torch.equal(after[name, "h"], state_after["h"])
+    torch.testing.assert_close(y, expected)
+    stored = torch.stack([state] * 5, dim=1)
+    assert block.replay(x, stored, is_init)[1].batch_size == (2, 5)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        ({"input_size": 2.5}, "^input_size must be a whole number from 1, got 2.5$"),
+        ({"hidden_size": 0}, "^hidden_size must be a whole number from 1, got 0$"),
+        ({"layers": 0}, "^layers must be at least 1, got 0$"),
+    ],
+)
+def test_sizes_of_a_block_are_whole_numbers_from_one(sizes, message):
+    with pytest.raises(ValueError, match=message):
+        MemoryBlock(**{"input_size": 3, "hidden_size": 4, "memory": "gru"} | sizes)
 
 
 def last_action_matters(network, is_init):
@@ -339,6 +376,35 @@ def test_dtype_follows_the_parameters():
     pixels, last_action, is_init = inputs()
     out, state = run(network, pixels, last_action, is_init, network.initial_state(2))
     assert out.dtype == torch.float64 and state["layer0", "h"].dtype == torch.float64
+
+
+@torch.no_grad()
+def test_sequences_need_neither_a_last_action_nor_a_state_that_nobody_reads():
+    network = make_network("small", "mlp", obs_size=32, use_last_action=False)
+    pixels, _, is_init = inputs(2, 4)
+    sequences = TensorDict({"pixels": pixels, "is_init": is_init.unsqueeze(-1)}, [2])
+    read = network.read_sequences(sequences, TensorDict({}, [2]))
+    with set_recurrent_mode(True):
+        written = network(sequences.auto_batch_size_(2))
+    torch.testing.assert_close(read["action_value"], written["action_value"])
+
+
+@torch.no_grad()
+def test_under_autocast_the_memory_reads_in_single_precision():
+    network = make_network("small", "gru", obs_size=32)
+    pixels, last_action, is_init = inputs(2, 4)
+    first = network.initial_state(2)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        features = network.encode(pixels).bfloat16()
+        _, state = network.remember(features, last_action, is_init, first)
+    _, expected = network.remember(features.float(), last_action, is_init, first)
+    assert (state == expected).all()
+
+
+def test_the_last_action_is_not_hidden_at_cuts():
+    block = MemoryBlock(8, 4, "gru")
+    with pytest.raises(ValueError, match=r"^zero_action_on_reset needs store='sequence'"):
+        MemoryNetwork(nn.Identity(), block, nn.Identity(), zero_action_on_reset=True, store="step")
 
 
 @pytest.mark.parametrize("memory", ["mingru", "lru"])

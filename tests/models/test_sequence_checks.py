@@ -142,6 +142,15 @@ def test_steps_that_only_a_count_tells_apart_are_refused() -> None:
         learn(agent, cut)
 
 
+def test_one_sequence_alone_is_looked_at_too() -> None:
+    module = MemoryModule(make_memory("gru", 3, 4), "seen", "out", default_recurrent_mode=True)
+    batch = TensorDict({"seen": torch.ones(1, 4, 3)}, [1, 4])
+    batch["is_init"] = torch.tensor([[True, False, False, False]]).unsqueeze(-1)
+    batch["step_count"] = torch.tensor([[0, 1, 7, 8]]).unsqueeze(-1)
+    with pytest.raises(ValueError, match="step_count goes from 1 to 7"):
+        module(batch)
+
+
 def test_slices_whose_starts_are_not_marked_are_refused() -> None:
     """TorchRL's ``ReplayBuffer`` marks none, its ``TensorDictReplayBuffer`` does."""
     agent = Agent()

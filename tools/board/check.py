@@ -22,13 +22,18 @@ from arcade_torch.tools.board.entry import (
     Hash,
     check_observations,
     check_protocol,
-    file_word,
     read_entry,
     read_table,
 )
-from arcade_torch.tools.board.evaluation import Evaluator, Played, made_with, weights_hash
+from arcade_torch.tools.board.evaluation import (
+    WEIGHTS,
+    Evaluator,
+    Played,
+    made_with,
+    weights_hash,
+)
 from arcade_torch.tools.board.protocol import PROTOCOL, Protocol
-from arcade_torch.tools.board.pull import pull
+from arcade_torch.tools.board.pull import folder_name, has_weights, pull
 from arcade_torch.tools.board.submit import Progress, checkpoint_name
 from arcade_torch.tools.run_folders import SETTINGS, RunFolders
 
@@ -40,6 +45,7 @@ SIZES = ("parameters", "state_bytes")
 """What an entry says once for all of its runs: the largest of them."""
 Origin = Literal["kept", "pulled", "retrained"]
 """Where checkpoints come from: a folder, the hub that the entry names, or its settings."""
+Candidates = dict[tuple[Any, ...], list[tuple[Path, TrainConfig]]]
 _Count = Annotated[int, Range("a whole number from 0", lambda x: 0 <= x <= 10**6)]
 
 
@@ -102,7 +108,8 @@ def check(
     chosen = _drawn(entry.runs, cells, generator or random.SystemRandom())
     if weights != "kept":
         get_missing = {"pulled": pull, "retrained": retrain}[weights]
-        get_missing(entry, chosen, runs, progress)
+        missing = _missing(entry, chosen, runs, weights)
+        get_missing(entry, missing, runs, progress)
     folders = find_folders(entry, chosen, runs)
     is_same = _is_same_machine(entry.made_with, made_with())
     if weights == "retrained" and not is_same:
@@ -134,33 +141,71 @@ def _drawn(runs: Sequence[BoardRun], count: int, generator: random.Random) -> li
 def find_folders(
     entry: Entry, runs: Sequence[BoardRun], below: Path
 ) -> dict[tuple[str, str, int], Path]:
-    """The run folder of every run, by its settings; an `EntryRefusedError` names one that is not
-    there.
+    """The run folder of every run, by its settings, and of several the one with its weights; an
+    `EntryRefusedError` names one that is not there.
     """
     if not below.is_dir():
         raise FileNotFoundError(f"{below} is no folder: give the one with the runs of the entry")
-    candidates = dict[tuple[Any, ...], list[tuple[Path, TrainConfig]]]()
+    candidates = _candidates(below)
+    folders = {}
+    for run in runs:
+        same, reason = _of_same_settings(entry, run, candidates)
+        if not same:
+            raise EntryRefusedError(
+                f"no run of {entry.memory} on {run.name} lies below {below}{reason}"
+            )
+        last = f"checkpoints/{checkpoint_name(entry.frames)}"
+        trained = [folder for folder in same if (folder / last / WEIGHTS).is_file()]
+        equal = [folder for folder in trained if has_weights(folder / last, run)]
+        folders[run.cell] = [*equal, *trained, *same][0]
+    return folders
+
+
+def _missing(
+    entry: Entry, runs: Sequence[BoardRun], below: Path, weights: Origin
+) -> list[BoardRun]:
+    """Runs that do not lie below a folder: with the weights of the entry, which are to be pulled,
+    or trained to their end.
+    """
+    candidates = _candidates(below)
+    missing = []
+    for run in runs:
+        same, _ = _of_same_settings(entry, run, candidates)
+        ends = [folder / "checkpoints" / checkpoint_name(entry.frames) for folder in same]
+        if weights == "pulled":
+            is_there = any(has_weights(end, run) for end in ends)
+        else:
+            is_there = any((end / WEIGHTS).is_file() for end in ends)
+        if not is_there:
+            missing.append(run)
+    return missing
+
+
+def _candidates(below: Path) -> Candidates:
+    """Run folders and their settings, by what an entry says of a run."""
+    candidates: Candidates = {}
     for folder in sorted(RunFolders().below(below)):
         config = _config_of(folder)
         if config is not None:
             key = (config.env, config.observability, config.seed, config.memory, config.algorithm)
             candidates.setdefault(key, []).append((folder, config))
-    folders = {}
-    for run in runs:
-        wanted = entry.config(run)
-        reasons = list[str]()
-        for folder, config in candidates.get((*run.cell, entry.memory, entry.algorithm), []):
-            differences = differing_fields(config, wanted)
-            if not differences:
-                folders[run.cell] = folder
-                break
-            reasons = [f"{folder} differs in {', '.join(differences)}"]
-        if run.cell not in folders:
-            reason = "".join(f"; {text}" for text in reasons)
-            raise EntryRefusedError(
-                f"no run of {entry.memory} on {run.name} lies below {below}{reason}"
-            )
-    return folders
+    return candidates
+
+
+def _of_same_settings(
+    entry: Entry, run: BoardRun, candidates: Candidates
+) -> tuple[list[Path], str]:
+    """The folders with the settings of a run, and in what the last of the others differs."""
+    wanted = entry.config(run)
+    same = list[Path]()
+    reason = ""
+    for folder, config in candidates.get((*run.cell, entry.memory, entry.algorithm), []):
+        differences = differing_fields(config, wanted)
+        if differences:
+            reason = f"; {folder} differs in {', '.join(differences)}"
+        else:
+            same.append(folder)
+    return same, reason
 
 
 def _play_again(
@@ -310,7 +355,7 @@ def retrain(
     out: Path,
     progress: Callable[[str, int, int], None] | None = None,
 ) -> None:
-    """Train runs of an entry from their settings, those that do not lie below a folder yet.
+    """Train runs of an entry from their settings, or go on with them.
 
     Games and memories have to be known to this process; nothing is imported for it.
 
@@ -326,8 +371,7 @@ def retrain(
             f"{MOST_FRAMES_AGAIN:,}: ask for the checkpoints"
         )
     for done, run in enumerate(runs, 1):
-        name = f"{run.game}__{run.twin}__{file_word(entry.memory)}__seed{run.seed}"
-        train(entry.config(run), out / name, resume=True)
+        train(entry.config(run), out / folder_name(entry, run), resume=True)
         if progress is not None:
             progress(f"trained {run.name}", done, len(runs))
 

@@ -67,7 +67,8 @@ def pull(
             f"{checkpoint}/{META}": MOST_TABLE,
             f"{checkpoint}/{WEIGHTS}": most_weights,
         }
-        if not _is_here(into / name / checkpoint, run):
+        # the weights are written last
+        if not has_weights(into / name / checkpoint, run):
             on_hub = {f"{name}/{file}": size for file, size in sizes.items()}
             source = hub.download(place["repo"], on_hub, revision=place["revision"]) / name
             _check_hash(source / checkpoint / WEIGHTS, run, most_weights)
@@ -77,8 +78,8 @@ def pull(
             progress(f"pulled {run.name}", done, len(runs))
 
 
-def _is_here(checkpoint: Path, run: BoardRun) -> bool:
-    """Whether a run was fetched before: its weights are written last."""
+def has_weights(checkpoint: Path, run: BoardRun) -> bool:
+    """Whether a checkpoint has the weights of a run."""
     try:
         return weights_hash(checkpoint) == run.weights_sha256
     except FileNotFoundError:

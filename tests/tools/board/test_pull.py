@@ -86,6 +86,22 @@ def test_what_is_pulled_is_checked_and_pulled_once(
     assert len(client.fetched) == 6
 
 
+def test_runs_of_the_same_settings_with_other_weights_may_lie_beside_what_is_pulled(
+    board: tuple[Path, FolderHub], tmp_path: Path
+) -> None:
+    """Runs that were trained again elsewhere: the check took them for what it had pulled."""
+    file, client = board
+    write_pair(tmp_path / "runs", seed=1)
+    for weights in (tmp_path / "runs").rglob("weights.safetensors"):
+        weights.write_bytes(weights.read_bytes()[:-1] + b"x")
+    check(file, tmp_path / "runs", protocol=SHORT, weights="pulled")
+    assert len(client.fetched) == 6
+    for folder in (tmp_path / "runs").glob("*__seed1"):
+        folder.rename(folder.with_name(f"kept {folder.name}"))
+    check(file, tmp_path / "runs", protocol=SHORT, weights="pulled")
+    assert len(client.fetched) == 6
+
+
 def test_other_weights_are_refused_before_anything_is_kept(
     board: tuple[Path, FolderHub], tmp_path: Path
 ) -> None:

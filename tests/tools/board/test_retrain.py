@@ -1,6 +1,7 @@
 """An entry without checkpoints is trained again from its settings, and gives the same bits."""
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -33,6 +34,25 @@ def test_a_run_that_is_trained_again_from_its_entry_has_the_same_weights_and_sco
     monkeypatch.setattr(checks, "MOST_FRAMES_AGAIN", 100)
     with pytest.raises(EntryRefusedError, match="are not trained again, at most 100"):
         check(file, tmp_path / "third", protocol=SHORT, weights="retrained")
+
+
+def test_runs_that_lie_there_under_any_name_are_not_trained_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train_twins(tmp_path / "runs")
+    file = tmp_path / "entry.json"
+    file.write_text(json.dumps(plain_entry(tmp_path / "runs")))
+    trained = []
+    monkeypatch.setattr(
+        "arcade_torch.agents.training.train",
+        lambda config, out, resume: trained.append(train(config, out, resume=resume)),
+    )
+    assert check(file, tmp_path / "runs", protocol=SHORT, weights="retrained").equal == 2
+    assert not trained
+    # one of them stopped before its end
+    shutil.rmtree(max(tmp_path.glob("runs/full/checkpoints/frames-*")))
+    assert check(file, tmp_path / "runs", protocol=SHORT, weights="retrained").equal == 2
+    assert len(trained) == 1
 
 
 def test_a_run_that_is_trained_elsewhere_is_compared_by_its_score_and_decides_nothing(
