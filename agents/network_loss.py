@@ -1,19 +1,15 @@
-"""What the losses share: networks whose weights the loss holds, also in a copy and after a move,
-and what they ask of a policy.
-"""
+"""What the losses share: networks whose weights the loss holds, also in a copy and after a move."""
 
 import copy
 from collections.abc import Callable
 from typing import Any, Literal, Self
 
 from tensordict import TensorDictParams
-from torch import Tensor
-from torch.distributions import Distribution
 from torchrl.objectives import LossModule
 
 from arcade_torch.envs_jax.validation import kind_of
 
-__all__ = ["NetworkLoss", "Reduction", "check_actor", "entropy_of"]
+__all__ = ["NetworkLoss", "Reduction", "check_actor"]
 
 Reduction = Literal["mean", "sum", "none"]
 """How a loss makes one number of those of all steps."""
@@ -27,15 +23,6 @@ def check_actor(network: Any) -> None:
             f"ProbabilisticActor; got {kind_of(network)} (of an ActorValueOperator: "
             "get_policy_operator(), get_value_operator())"
         )
-
-
-def entropy_of(policy: Distribution) -> Tensor:
-    """The entropy of a policy; from one draw where there is no formula, as TorchRL's losses do."""
-    try:
-        return policy.entropy()
-    except NotImplementedError:
-        drawn = policy.rsample() if policy.has_rsample else policy.sample()
-        return -policy.log_prob(drawn)
 
 
 class NetworkLoss(LossModule):

@@ -31,9 +31,9 @@ from arcade_torch.agents.checked import Finite, Positive, coerce, require
 from arcade_torch.agents.config import PPOConfig, TimeLimit
 from arcade_torch.agents.layout import NetworkInputs, as_steps
 from arcade_torch.agents.learner import Learner, Training
-from arcade_torch.agents.network_loss import NetworkLoss, Reduction, check_actor, entropy_of
+from arcade_torch.agents.network_loss import NetworkLoss, Reduction, check_actor
 from arcade_torch.agents.policy import make_actor
-from arcade_torch.agents.returns import SequenceGAE
+from arcade_torch.agents.returns import SequenceGAE, normalize
 from arcade_torch.envs_jax.validation import plain
 
 
@@ -87,18 +87,13 @@ def ppo_objective(
     }
 
 
-def normalize(advantage: Tensor, mask: Tensor | None = None) -> Tensor:
-    """Deviations from the mean, divided by the population deviation; finite where all are equal.
-
-    Where a ``mask`` of the same shape is false nothing counts, and the result is 0.
-    """
-    if mask is None:
-        centred = advantage - advantage.mean()
-        return centred / (centred.square().mean().sqrt() + 1e-8)
-    count = mask.sum().clamp_min(1)
-    mean = advantage.where(mask, 0).sum() / count
-    centred = (advantage - mean).where(mask, 0)
-    return centred / ((centred.square().sum() / count).sqrt() + 1e-8)
+def entropy_of(policy: Distribution) -> Tensor:
+    """The entropy of a policy; from one draw where there is no formula, as TorchRL's losses do."""
+    try:
+        return policy.entropy()
+    except NotImplementedError:
+        drawn = policy.rsample() if policy.has_rsample else policy.sample()
+        return -policy.log_prob(drawn)
 
 
 class PPOLoss(NetworkLoss):

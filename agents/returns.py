@@ -124,6 +124,20 @@ def gae(
     return solve_backward(reward + gamma * after - value.to(reward.dtype), trace)
 
 
+def normalize(advantage: Tensor, mask: Tensor | None = None) -> Tensor:
+    """Deviations from the mean, divided by the population deviation; finite where all are equal.
+
+    Where a ``mask`` of the same shape is false nothing counts, and the result is 0.
+    """
+    if mask is None:
+        centred = advantage - advantage.mean()
+        return centred / (centred.square().mean().sqrt() + 1e-8)
+    count = mask.sum().clamp_min(1)
+    mean = advantage.where(mask, 0).sum() / count
+    centred = (advantage - mean).where(mask, 0)
+    return centred / ((centred.square().sum() / count).sqrt() + 1e-8)
+
+
 def values_and_traces(
     reward: Tensor,
     next_value: Tensor,

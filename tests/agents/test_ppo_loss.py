@@ -18,7 +18,8 @@ import arcade_torch
 from arcade_torch.agents import PPOConfig, PPOLoss, SequenceGAE, make_actor
 from arcade_torch.agents.layout import as_steps
 from arcade_torch.agents.learner import Training, epsilon_at, learning_rate_at
-from arcade_torch.agents.ppo import PPO, normalize, ppo_objective
+from arcade_torch.agents.ppo import PPO, ppo_objective
+from arcade_torch.agents.returns import normalize
 from arcade_torch.models import ActorCriticNetwork, make_actor_critic
 from tests.agents.fakes import (
     ACTIONS,
