@@ -1,5 +1,7 @@
 """Greedy evaluation on seeds that training never sees."""
 
+import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -122,6 +124,7 @@ def evaluate(
     ``episodes`` environments.
 
     Every environment contributes exactly one episode, so long episodes count as much as short ones.
+    A warning says in how many of them the agent decided by outputs that are NaN.
 
     Args:
         agent: an ``Agent``, played where its network is; with ``env``, anything with
@@ -207,18 +210,35 @@ def _play(agent: Any, env: Any) -> EvalResult:
     returns = np.zeros(num_envs, np.float32)
     lengths = np.zeros(num_envs, np.int64)
     playing = np.ones(num_envs, bool)
+    is_lost = np.zeros(num_envs, bool)
     steps = 0
     while playing.any():
         check_ends(env.game, steps)
         steps += 1
-        action, _, state = agent.act(obs, state)
+        action, extras, state = agent.act(obs, state)
+        is_lost |= _are_nan(extras, num_envs) & playing
         step, obs = env.step_and_maybe_reset(obs.set("action", action))
         ended = step["next", "done"].view(-1).cpu().numpy() & playing
         if ended.any():
             returns[ended] = step["next", "episode_reward"].view(-1).cpu().numpy()[ended]
             lengths[ended] = step["next", "step_count"].view(-1).cpu().numpy()[ended]
             playing &= ~ended
+    if is_lost.any():
+        warnings.warn(
+            f"the agent's outputs are NaN in {is_lost.sum()} of {num_envs} episodes, and its "
+            "actions say nothing there: its state may grow beyond all bounds",
+            stacklevel=4,
+        )
     return EvalResult(returns, lengths, _games_played(env))
+
+
+def _are_nan(extras: Any, num_envs: int) -> NDArray[np.bool_]:
+    """Where an agent decides by outputs that are no numbers, bool [N]; nowhere if it shows none."""
+    for name in ("q_value", "logits"):
+        if isinstance(extras, Mapping) and name in extras:
+            are_nan: NDArray[np.bool_] = extras[name].isnan().any(-1).cpu().numpy()
+            return are_nan
+    return np.zeros(num_envs, np.bool_)
 
 
 def _games_played(env: Any) -> tuple[str, ...]:

@@ -1,5 +1,7 @@
 """Evaluation plays one whole episode in each fresh environment."""
 
+import warnings
+
 import pytest
 import scipy.stats
 import torch
@@ -88,6 +90,24 @@ def test_the_twin_can_be_chosen(env):
     evaluate(player, seed=3, env=env)
     assert seen["as it is"] == seen["partial"] and env.observability.all()
     env.set_observability("full")
+
+
+class Lost(Clock):
+    """Decides by outputs, which are no numbers in the first two environments from step 5 on."""
+
+    def act(self, obs, state):
+        action, _, after = super().act(obs, state)
+        values = torch.nn.functional.one_hot(action, 5).float()
+        values[:2] = values[:2].where(state["t"][:2, None] < 5, torch.nan)
+        return values.argmax(-1), {"q_value": values}, after
+
+
+def test_decisions_by_outputs_that_are_no_numbers_are_told(env):
+    with pytest.warns(UserWarning, match=r"NaN in 2 of 6 episodes"):
+        assert len(evaluate(Lost(), env=env).returns) == 6
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        evaluate(Clock(), env=env)
 
 
 def test_numbers_about_the_returns(env):
