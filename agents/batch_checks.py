@@ -52,6 +52,13 @@ def is_stock(batch: TensorDictBase, is_init: Key = "is_init") -> bool:
     return batch.ndim != 1 or flags.shape == (*batch.shape, 1)
 
 
+def is_prepared(batch: TensorDictBase) -> bool:
+    """Whether a batch is what ``insert_final_observations`` gave; an observation may be called as
+    an entry of that.
+    """
+    return isinstance(batch.get("extended", None), TensorDictBase) and "position" in batch
+
+
 def step_mask(batch: TensorDictBase, shape: torch.Size) -> Tensor | None:
     """Which steps are no padding, bool of this shape [..., L]; None if the batch does not say."""
     masks = []
@@ -112,6 +119,19 @@ def written(steps: TensorDictBase, key: Key, network: TensorDictModuleBase) -> T
             "entry with set_keys, or let it write that"
         )
     return value  # type: ignore[no-any-return]
+
+
+def loads_at_starts(network: TensorDictModuleBase) -> bool:
+    """Whether all memories known here read, in a pass over time, the state that is given where an
+    episode begins; as they act they drop it.
+    """
+    loads = set()
+    for module in network.modules():
+        if isinstance(module, MemoryModule | MemoryNetwork):
+            loads.add(module.store == "step")
+        elif isinstance(module, LSTMModule | GRUModule):
+            loads.add(True)
+    return loads == {True}
 
 
 def check_state_keys(network: TensorDictModuleBase) -> None:

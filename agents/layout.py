@@ -24,6 +24,7 @@ from arcade_torch.agents.batch_checks import (
     entry,
     flat,
     is_stock,
+    loads_at_starts,
     step_mask,
     written,
 )
@@ -52,6 +53,7 @@ class NetworkInputs:
                 self.stores.add(module.store)
                 self.start_keys.add(module.recurrence.is_init_key)
         self.reads_first_state_only = self.stores == {"sequence"}
+        self.loads_at_starts = loads_at_starts(network)
 
 
 def insert_final_observations(
@@ -111,15 +113,8 @@ def insert_final_observations(
     for name, outcome in outcomes.items():
         out[name] = outcome[:, burn_in:]
     _add_observations(out, batch, inputs, final_steps, order, burn_in)
-    _add_state(out, batch, inputs, burn_in)
+    _add_state(out, batch, inputs)
     return out
-
-
-def is_prepared(batch: TensorDictBase) -> bool:
-    """Whether a batch is what :func:`insert_final_observations` gave; an observation may be called
-    as an entry of that.
-    """
-    return isinstance(batch.get("extended", None), TensorDictBase) and "position" in batch
 
 
 def _stored_state(batch: TensorDictBase) -> TensorDictBase | None:
@@ -275,7 +270,7 @@ def _add_observations(
         out["burn_in"] = before
 
 
-def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs, burn_in: int) -> None:
+def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs) -> None:
     """Write ``initial_state``, the recurrent state before the first step."""
     if not inputs.state_keys:
         return
@@ -351,6 +346,8 @@ def unroll(
         with torch.no_grad(), set_recurrent_mode(False):
             for t in range(burn_in.shape[1]):
                 step = _with_state(burn_in[:, t], state, inputs)
+                if t == 0 and state is not None and inputs.loads_at_starts:
+                    _clear_starts(step, inputs)  # as in a pass over time
                 state = network(step).get("next").select(*inputs.state_keys)
             state = _loaded_at_start(extended[:, 0], state, inputs)
     if isinstance(network, MemoryNetwork) and network.store == "sequence" and key in network.heads:
@@ -407,10 +404,15 @@ def _with_state(
         return step
     if any(key in step for key in inputs.state_keys):
         state = _loaded_at_start(step, state, inputs)
-        for key in inputs.start_keys:
-            if key in step:
-                step[key] = torch.zeros_like(step[key])  # which would drop what was loaded
+        _clear_starts(step, inputs)
     return step.update(state)
+
+
+def _clear_starts(step: TensorDictBase, inputs: NetworkInputs) -> None:
+    """Let nothing begin at a step: its flags would drop the state that was loaded."""
+    for key in inputs.start_keys:
+        if key in step:
+            step[key] = torch.zeros_like(step[key])
 
 
 def _loaded_at_start(

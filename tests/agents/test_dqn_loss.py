@@ -164,6 +164,23 @@ def test_a_slice_of_an_episode_starts_from_its_stored_state(kind, burn_in):
     assert not torch.equal(loss(batch)["loss"], found)
 
 
+@pytest.mark.parametrize("kind", ["step", "TorchRL"])
+def test_a_burn_in_begins_with_the_given_state_as_a_pass_without_one_does(kind):
+    """Sequences that somebody has cut: their flag at the first step does not drop the state."""
+    network = gru_of_torchrl() if kind == "TorchRL" else toy_network(store=kind)
+    s = stream(2, 8, seed=1, ends=0.0)
+    s.is_init[:], s.is_init[:, 0] = False, True
+    batch = s.sequences()
+    state = torch.rand(2, WIDTH)
+    state = state.unsqueeze(1) if kind == "TorchRL" else state
+    batch["initial_state"] = TensorDict({"memory": {"h": state}}, [2])
+    found = look_into(make_loss(network, burn_in=3), batch.clone())[0]
+    whole = look_into(make_loss(network), batch.clone())[0]
+    torch.testing.assert_close(found, whole[:, 3:])
+    batch["initial_state"].zero_()
+    assert not torch.equal(look_into(make_loss(network, burn_in=3), batch)[0], found)
+
+
 @pytest.mark.parametrize("kind", ["sequence", "step", "TorchRL"])
 def test_a_burn_in_of_whole_episodes_needs_no_stored_state(kind):
     network = gru_of_torchrl() if kind == "TorchRL" else toy_network(store=kind)

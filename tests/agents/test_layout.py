@@ -153,7 +153,6 @@ def test_a_memory_that_stores_every_step_starts_from_the_states_it_was_given(bur
         batch["memory", "h"] = states
     else:
         states[:, 1:] = 0  # sequences have none of later steps
-        states[s.is_init[:, 0], 0] = 0  # what a collector gives where an episode begins
         batch["initial_state", "memory", "h"] = states[:, 0]
     h, wanted = states[:, 0], []
     for t in range(8):
