@@ -9,12 +9,14 @@ import pytest
 
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench.registry import TABLES, compare, page, read_results
+from arcade_torch.tools.files import read_csv
 from tests.tools.test_cli import one_error
 
 RESULTS: dict[str, Any] = {
     "format": 1,
     "machine": {"processor": "x86_64", "cores": 2},
     "size": "tiny",
+    "settings": {"envs": {"games": ["G"], "threads": 2}, "memory": {"batch": 16, "threads": 1}},
     "tables": {
         "envs": {
             "rows": [
@@ -99,11 +101,13 @@ def test_the_command_names_what_is_worse_missing_and_new_and_exits_with_1(
 ) -> None:
     new = changed(frames_per_s=500.0)
     new["machine"]["cores"] = 4
+    new["settings"] = {"memory": {"batch": 64, "threads": 1}, "train": {"threads": 1}}
     new["tables"]["scans"]["rows"][0]["steps"] = 16
     old, other = written(tmp_path / "old.json", RESULTS), written(tmp_path / "new.json", new)
     assert cli.main(["bench", "compare", str(old), str(other)]) == cli.EXIT_FAILED
     said = capsys.readouterr().out
-    assert "not the same machine: cores 2 and 4" in said
+    assert "not the same machine: cores 2 and 4\n" in said
+    assert "not the same settings of memory: batch 16 and 64\n" in said
     assert (
         "worse: envs: game G, obs_size 128, num_envs 16, measure env: frames_per_s 1,000 -> 500 "
         "frames/s" in said
@@ -123,6 +127,7 @@ def test_the_command_names_what_is_worse_missing_and_new_and_exits_with_1(
         ([], "is no file of `arcade-torch bench all`"),
         (RESULTS | {"format": 2}, "is no file of `arcade-torch bench all` in format 1"),
         (RESULTS | {"machine": None}, "does not say on which machine"),
+        (RESULTS | {"settings": {"envs": 1}}, "settings must be a table of options"),
         (RESULTS | {"tables": {"cooking": {"rows": []}}}, "unknown table 'cooking'"),
         (RESULTS | {"tables": {"envs": []}}, "has no list of rows"),
         (RESULTS | {"tables": {"envs": {"rows": [1]}}}, "has no list of rows"),
@@ -155,6 +160,50 @@ def test_the_page_has_a_table_each_and_hostile_names_stay_in_their_cells() -> No
     rows = [line for line in text.splitlines() if line.startswith("|")]
     assert any("a\\|b" in row for row in rows)
     assert "| G | 128 | 16 | env | 1,000 |" in rows
+    assert "- memory: batch 16, threads 1\n" in text
+
+
+def test_a_file_from_before_settings_were_kept_is_compared(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    older = {name: value for name, value in RESULTS.items() if name != "settings"}
+    old = written(tmp_path / "old.json", older)
+    new = written(tmp_path / "new.json", RESULTS)
+    assert cli.main(["bench", "compare", str(old), str(new)]) == cli.EXIT_OK
+    assert "not the same" not in capsys.readouterr().out
+
+
+def test_a_benchmark_says_at_what_size_and_on_how_many_threads_it_ran(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [
+        "bench",
+        "memory",
+        "gru",
+        "--steps",
+        "4",
+        "--layers",
+        "1",
+        "--size",
+        "8",
+        "--batch",
+        "2",
+        "--frames",
+        "4",
+    ]
+    words += ["--seconds", "0.001", "--repeats", "1"]
+    for threads in (1, 2):
+        out = tmp_path / f"{threads}.json"
+        assert cli.main([*words, "--threads", str(threads), "--out", str(out)]) == cli.EXIT_OK
+        said = capsys.readouterr().out
+        assert f"threads {threads}" in said and "torch_threads" not in said
+        assert "size 8" in said and "batch 2" in said
+        settings = read_results(out)["settings"]["memory"]
+        assert (settings["size"], settings["batch"], settings["threads"]) == (8, 2, threads)
+    table = tmp_path / "table.csv"
+    assert cli.main([*words, "--out", str(table)]) == cli.EXIT_OK
+    (row, *_) = read_csv(tmp_path / "table_models.csv")
+    assert (row["steps"], row["size"], row["batch"], row["threads"]) == ("4", "8", "2", "1")
 
 
 def test_a_tiny_benchmark_of_everything_is_written_read_and_equals_itself(

@@ -4,6 +4,7 @@ such files.
 ::
 
     {"format": 1, "machine": {...}, "size": "quick",
+     "settings": {"memory": {"batch": 16, "size": 512, "threads": 1, ...}, ...},
      "tables": {"envs": {"rows": [{"game": ..., "num_envs": 128, "frames_per_s": 22000.0}, ...]},
      ...}}
 """
@@ -78,6 +79,8 @@ class Kind(NamedTuple):
     numbers: dict[str, str]
 
 
+MACHINE = ("processor", "cores", "jax_device", "keep_memory")
+"""What must be the same of two machines whose numbers are compared."""
 MORE_IS_BETTER = ("frames/s", "share")
 _TIMES = {"forward_ms": "ms", "both_ms": "ms"}
 TABLES: dict[str, Kind] = {
@@ -123,20 +126,52 @@ def measure(
     """Run benchmarks one after another, those that keep freed memory last; the content of a file,
     four digits.
     """
+    import torch
+
     from arcade_torch.tools.machine import keep_freed_memory, machine
 
     tables: dict[str, Any] = {}
+    settings: dict[str, dict[str, Any]] = {}
     kept = [name for name, options in benches.items() if options.keep_memory]
     for name in sorted(benches, key=kept.__contains__):
         if name in kept:
             keep_freed_memory()
+        settings[name] = _settings(benches[name])
         for table, row in module_of(name).run(benches[name], log):
+            # a benchmark that sets torch's threads has them set between its rows
+            settings[name]["threads"] = torch.get_num_threads()
             short = {}
             for key, value in row.items():
                 short[key] = float(f"{value:.4g}") if isinstance(value, float) else value
             tables.setdefault(table, {"rows": []})["rows"].append(short)
     about = machine() | {"keep_memory": ", ".join(kept) or "no"}
-    return {"format": FORMAT, "machine": about, "size": size, "tables": tables}
+    del about["torch_threads"]  # of the process; a benchmark's own are among its settings
+    return {
+        "format": FORMAT,
+        "machine": about,
+        "size": size,
+        "settings": settings,
+        "tables": tables,
+    }
+
+
+def _settings(options: BenchOptions) -> dict[str, Any]:
+    """Options as JSON has them, without the files they name and what the machine tells."""
+    settings = {}
+    for name, value in vars(options).items():
+        if name != "keep_memory" and not isinstance(value, Path):
+            settings[name] = list(value) if isinstance(value, tuple) else value
+    return settings
+
+
+def named(values: Mapping[str, Any]) -> str:
+    """Names and values on one line, without those that are empty."""
+    words = []
+    for name, value in values.items():
+        text = " ".join(map(str, value)) if isinstance(value, list) else str(value)
+        if value is not None and text:
+            words.append(f"{name} {text}")
+    return ", ".join(words)
 
 
 def read_results(path: Path) -> dict[str, Any]:
@@ -152,6 +187,9 @@ def read_results(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is no file of `arcade-torch bench all` in format {FORMAT}")
     if not isinstance(values.get("machine"), dict) or not isinstance(values.get("size"), str):
         raise ValueError(f"{path} does not say on which machine and at what size it was measured")
+    settings = values.setdefault("settings", {})  # a file of 0.2.0 or earlier has none
+    if not isinstance(settings, dict) or not all(isinstance(x, dict) for x in settings.values()):
+        raise ValueError(f"{path}: settings must be a table of options for each benchmark")
     try:
         _numbers(values)
     except ValueError as error:
@@ -191,6 +229,27 @@ def _is_measured(value: Any) -> bool:
     """Whether a value is a number that a benchmark can have measured."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return is_number and 0 <= value < 1e15
+
+
+def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """What of two files' machines, and of the settings of benchmarks that both have, is not the
+    same: a line for each.
+    """
+    lines = []
+    compared = [("machine", old["machine"], new["machine"], MACHINE)]
+    for name, was in old["settings"].items():
+        if name in new["settings"]:
+            now = new["settings"][name]
+            compared.append((f"settings of {name}", was, now, tuple(was | now)))
+    for subject, was, now, columns in compared:
+        differs = [
+            f"{column} {was.get(column)} and {now.get(column)}"
+            for column in columns
+            if was.get(column) != now.get(column)
+        ]
+        if differs:
+            lines.append(f"not the same {subject}: {', '.join(differs)}")
+    return lines
 
 
 def compare(
@@ -250,8 +309,10 @@ def _short(value: float | None) -> str:
 
 def page(results: Mapping[str, Any]) -> str:
     """All tables as one Markdown page."""
-    machine = ", ".join(f"{name} {value}" for name, value in results["machine"].items() if value)
-    lines = ["# Benchmarks", "", f"`make bench`, size {results['size']}. {machine}.", ""]
+    about = f"`make bench`, size {results['size']}. {named(results['machine'])}."
+    lines = ["# Benchmarks", "", about, ""]
+    lines += [f"- {name}: {named(settings)}" for name, settings in results["settings"].items()]
+    lines += [""] if results["settings"] else []
     for name, table in results["tables"].items():
         title, key, numbers = TABLES[name]
         heads = [*key, *(f"{column} ({unit})" for column, unit in numbers.items())]

@@ -37,7 +37,6 @@ class Bench(Command):
     def run(self) -> int:
         """Measure, print, save."""
         out = self.options.out
-        about = vars(self.options)
         endings = (".csv",) if self.options.resumable else (".csv", ".json")
         require(
             out is None or out.suffix in endings,
@@ -48,14 +47,14 @@ class Bench(Command):
         if out is not None:
             check_writable(out)
         results = registry.measure({self.name: self.options}, "one", _log)
-        results["machine"] |= {name: about[name] for name in ("env", "device") if name in about}
         for name, table in results["tables"].items():
             title, key, _ = registry.TABLES[name]
             columns = list(table["rows"][0])
             cells = [list(map(format_value, row.values())) for row in table["rows"]]
             names = next(place for place, column in enumerate(columns) if column not in key)
             Table(title, columns, cells, left=names).show()
-        say(", ".join(f"{name} {value}" for name, value in results["machine"].items() if value))
+        say(registry.named(results["settings"][self.name]))
+        say(registry.named(results["machine"]))
         if out is not None and not self.options.resumable:
             for path in _save(out, results):
                 say(path)
@@ -126,16 +125,8 @@ class BenchCompare(Command):
         require(0 < self.tolerance < 1, "--tolerance", self.tolerance, "between 0 and 1")
         old = registry.read_results(self.old)
         new = registry.read_results(self.new)
-        was = old["machine"]
-        now = new["machine"]
-        about = ("processor", "cores", "jax_device", "torch_threads", "keep_memory")
-        differs = [
-            f"{name} {was.get(name)} and {now.get(name)}"
-            for name in about
-            if was.get(name) != now.get(name)
-        ]
-        if differs:
-            say(f"not the same machine: {', '.join(differs)}")
+        for line in registry.differences(old, new):
+            say(line)
         changes = registry.compare(old, new, self.tolerance)
         for verdict in ("worse", "missing", "better", "new"):
             for line in changes[verdict]:
@@ -149,13 +140,26 @@ def _log(text: str) -> None:
 
 
 def _save(out: Path, results: Mapping[str, Any]) -> list[Path]:
-    """One JSON file, or a CSV file a table that repeats in every row what is known of the
-    machine.
+    """One JSON file, or a CSV file a table that repeats in every row the settings and what is known
+    of the machine.
     """
     if out.suffix == ".json":
         return [write_json(out, results)]
+    (settings,) = results["settings"].values()
+    about = settings | results["machine"]
     paths = []
     for name, table in results["tables"].items():
         path = out if len(results["tables"]) == 1 else out.with_name(f"{out.stem}_{name}.csv")
-        paths.append(write_csv(path, [{**row, **results["machine"]} for row in table["rows"]]))
+        paths.append(write_csv(path, [_beside(row, about) for row in table["rows"]]))
     return paths
+
+
+def _beside(row: Mapping[str, Any], about: Mapping[str, Any]) -> dict[str, Any]:
+    """A row and beside it what it does not say itself; where several values were asked for, a
+    row says which one is its own.
+    """
+    columns = dict(row)
+    for name, value in about.items():
+        if name not in row and not isinstance(value, list):
+            columns[name] = value
+    return columns
