@@ -15,6 +15,7 @@ from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools.names import AgentKey, agent_names, bare_name, game_names, plain_number
 from arcade_torch.tools.run_folders import RunFolders
 from arcade_torch.tools.runs import FREE, Run, Score, open_run
+from arcade_torch.tools.text import printable
 
 _CELL = {
     "env",
@@ -249,6 +250,6 @@ def _check_twins(runs: Runs) -> None:
 def _check_settings(pair: str, one: Run, other: Run) -> None:
     differences = []
     for name, values in differing_values(one.config, other.config, _CELL | FREE).items():
-        differences.append(f"{name}: {values[0]} and {values[1]}")
+        differences.append(printable(f"{name}: {values[0]} and {values[1]}"))
     if differences:
         raise ValueError(f"{pair} differ in {', '.join(differences)}; give runs with one of them")

@@ -4,6 +4,7 @@
 
 import functools
 import random
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -200,7 +201,8 @@ def test_a_state_is_taken_whole_or_refused_and_the_env_stays_as_it_was(seed: int
                 (None, {}, state.to_dict() if keys else 3, "x", TensorDict({}, [2]), torch.zeros(2))
             )
         elif kind == 2 and keys:
-            state = state[:1] if rng.random() < 0.5 else torch.cat([state, state])
+            with suppress(NotImplementedError):  # an earlier change has put a sparse tensor there
+                state = state[:1] if rng.random() < 0.5 else torch.cat([state, state])
         elif keys:
             key = rng.choice(keys)
             old = state.get(key)

@@ -140,6 +140,12 @@ def test_all_settings_that_differ_are_named(tmp_path: Path) -> None:
         find_runs([tmp_path])
 
 
+def test_a_setting_with_a_line_break_in_its_name_is_told_in_one_line(tmp_path: Path) -> None:
+    two_seeds(tmp_path, "a\nb", ABSENT, "x\x1b")
+    with pytest.raises(ValueError, match=r"differ in a\\nb: None and x\\x1b; give runs"):
+        find_runs([tmp_path])
+
+
 @pytest.mark.parametrize("bare", ["CartPoleEasy", "NoisyPoleEasy"])
 def test_a_game_with_and_without_its_version_or_by_its_alias_is_one_game(
     bare: str, tmp_path: Path
