@@ -3,6 +3,7 @@ files are not believed.
 """
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,31 @@ def test_the_mean_that_a_training_writes_is_believed() -> None:
             values = {"mean": result.mean, "returns": returns.tolist()}
             assert wrong_mean(values) == "" and is_final(values)
     assert is_final({"mean": float("nan"), "returns": [0.5, float("nan")]})
-    assert not is_final({"mean": 0.5, "returns": [float("nan")]})
+    for nothing in (float("nan"), float("inf")):
+        assert not is_final({"mean": 0.5, "returns": [nothing]})
+
+
+@pytest.mark.filterwarnings("ignore:.*(overflow|invalid value) encountered:RuntimeWarning")
+@pytest.mark.parametrize("returns", [[np.inf], [-np.inf, 1], [np.inf, -np.inf], [1e30, 2e30]])
+def test_an_infinite_evaluation_is_one_and_is_not_made_again(
+    returns: list[float], tmp_path: Path
+) -> None:
+    result = EvalResult(np.array(returns, np.float32), np.ones(len(returns), np.int64))
+    folder = write_study(tmp_path / "s", small_study())
+    path = folder.run(small_study().runs()[0]).path
+    values = {
+        "mean": result.mean,
+        "std": result.std,
+        "ci": result.half_width,
+        "returns": result.returns.tolist(),
+        "lengths": result.lengths.tolist(),
+    }
+    file = path / "eval.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | values))
+    assert RunFolder(path).finished() is not None
+    row = folder.write_results(small_study())[0]
+    assert row["status"] == "finished"
+    assert math.isfinite(row["eval_mean"]) == (returns[0] == 1e30)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@ nothing.
 """
 
 import json
+import math
 import os
 import re
 import shutil
@@ -17,6 +18,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from arcade_torch.tools import cli, gap_and_bias, players, report, reports
+from arcade_torch.tools.comparable import find_runs
+from arcade_torch.tools.figures.logs import curves_of_runs
 from arcade_torch.tools.figures.style import agent_colours, agent_markers, drawing, svg
 from arcade_torch.tools.measures.saliency import figure as saliency
 from arcade_torch.tools.players import Baseline, references
@@ -173,17 +176,29 @@ def test_a_mean_over_fewer_tasks_is_said_to_be_one(
     assert re.search(r"mean of the MDPs</td><td>0\.63[23]</td>", page)
 
 
-def test_a_run_without_a_score_is_not_averaged_away(tmp_path: Path, no_oracles: None) -> None:
+@pytest.mark.parametrize("score", [math.nan, math.inf, -math.inf])
+def test_a_run_without_a_score_is_not_averaged_away(
+    score: float, tmp_path: Path, no_oracles: None
+) -> None:
     study = small_study(subject="mingru")
     folder = write_study(tmp_path / "s", study)
-    file = folder.run(study.runs()[0]).path / "eval.json"
-    nan = float("nan")
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"mean": nan, "returns": [nan, 0.5]}))
+    path = folder.run(study.runs()[0]).path
+    file = path / "eval.json"
+    changes = {"mean": score, "returns": [score, 0.5]}
+    file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    *evaluations, last = (path / "eval.csv").read_text().splitlines()
+    last = f"{last.partition(',')[0]},{score},nan,128"
+    (path / "eval.csv").write_text("\n".join([*evaluations, last, ""]))
     parts = ("saliency", "recall", "counterfactual", "beliefs", "contamination")
     page = report(folder.root, skip=parts).read_text()
-    assert "is nan" in page  # in the place of gap and bias
+    assert f"is {score}" in page  # in the place of gap and bias
     assert "since the score of a run is no number" in page
-    assert re.search(r"<td>nan</td><td></td><td class=.many.>nan  0\.520</td>", page)
+    assert re.search(rf"<td>nan</td><td></td><td class=.many.>{score}  0\.520</td>", page)
+    curves = curves_of_runs(find_runs([folder.root]).groups())
+    with_it = curves["mingru", "MineSweeperEasy", "full"].returns.mean
+    without = curves["mingru", "MineSweeperEasy", "partial"].returns.mean
+    assert np.isfinite(with_it).tolist() == [True, True, True, True, False]
+    assert np.isfinite(without).all()
 
 
 def test_a_part_that_does_not_exist_is_refused(tmp_path: Path) -> None:

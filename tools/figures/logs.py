@@ -146,8 +146,9 @@ def curves_of_runs(
 ) -> dict[tuple[str, str, str], Curve]:
     """A curve for each group, (agent, game, observability) -> its runs, that has logged something.
 
-    It goes over the frames that all runs of the group have reached. ``kind`` is ``eval`` (greedy
-    evaluations) or ``train`` (running mean of training returns, exploration included).
+    It goes over the frames that all runs of the group have reached, without a mean where one has no
+    finite number. ``kind`` is ``eval`` (greedy evaluations) or ``train`` (running mean of training
+    returns, exploration included).
     """
     curves = {}
     for task, runs in groups.items():
@@ -155,9 +156,12 @@ def curves_of_runs(
         if not histories:
             continue
         grid = _shared_frames(histories, kind)
-        if grid.size:
-            seeds = [np.interp(grid, history.frames, history.values) for history in histories]
-            curves[task] = Curve(grid, pooled(seeds, confidence))
+        if not grid.size:
+            continue
+        seeds = np.stack([np.interp(grid, *history) for history in histories])
+        # the mean of the other seeds would be that of another agent
+        seeds[:, ~np.isfinite(seeds).all(axis=0)] = np.nan
+        curves[task] = Curve(grid, pooled(seeds, confidence))
     return curves
 
 
@@ -170,12 +174,8 @@ class History(NamedTuple):
 
 def _histories(runs: Sequence[Run], kind: str) -> list[History]:
     """The histories of the runs that have logged something."""
-    histories = []
-    for run in runs:
-        history = _history(run, kind)
-        if history.frames.size:
-            histories.append(history)
-    return histories
+    histories = [_history(run, kind) for run in runs]
+    return [history for history in histories if history.frames.size]
 
 
 def _shared_frames(histories: Sequence[History], kind: str) -> Array:

@@ -67,10 +67,10 @@ def iqm(cells: Sequence[Array]) -> Array:
 def percentile_interval(
     value: Any, draws: Array, confidence: float, has_interval: bool = True
 ) -> Interval:
-    """Percentile interval of an estimate from its bootstrap draws; ends are NaN without draws, or
-    if not ``has_interval``.
+    """Percentile interval of an estimate from its bootstrap draws; ends are NaN without draws, of
+    what is not finite, or if not ``has_interval``.
     """
-    if not has_interval or not len(draws):
+    if not has_interval or not len(draws) or not math.isfinite(value):
         return Interval(float(value), float("nan"), float("nan"))
     low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
     return Interval(float(value), float(low), float(high))

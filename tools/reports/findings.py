@@ -124,7 +124,7 @@ def way(value: float, levels: Mapping[str, float]) -> float | None:
     """The share of the way from the random policy to the oracle; None where that is not known."""
     low = levels.get("random")
     high = levels.get("state")
-    if low is None or high is None or high == low or math.isnan(value):
+    if low is None or high is None or high == low or not math.isfinite(value):
         return None
     return (value - low) / (high - low)
 

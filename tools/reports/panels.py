@@ -4,6 +4,7 @@ All agents of a small study are looked into, and of a large one a few that stand
 pictures of a measure stand beside its figure.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
@@ -114,7 +115,7 @@ def curve_panels(
     panels = []
     for (game, twin), by_agent in style.agents_by_task(curves).items():
         means = levels.get(game, {})
-        inside = [*returns_of_game[game], *means.values()]
+        inside = list(filter(math.isfinite, [*returns_of_game[game], *means.values()])) or [0.0]
         low = min(inside)
         high = max(inside)
         margin = 0.07 * (high - low) or 0.5

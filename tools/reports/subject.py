@@ -119,7 +119,7 @@ def _verdict(pair: Pair, tasks: int, subject: str) -> str:
         f"{pair.other_return:.2f}"
     )
     difference = pair.difference
-    if math.isnan(difference.value):
+    if not math.isfinite(difference.value):
         return f"{fact}, since the score of a run is no number"
     if not difference.exists:
         return f"{fact}, with a single seed, which says nothing about others"
