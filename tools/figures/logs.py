@@ -161,7 +161,7 @@ def curves_of_runs(
         seeds = np.stack([np.interp(grid, *history) for history in histories])
         # the mean of the other seeds would be that of another agent
         seeds[:, ~np.isfinite(seeds).all(axis=0)] = np.nan
-        curves[task] = Curve(grid, pooled(seeds, confidence))
+        curves[task] = Curve(grid, pooled(list(seeds), confidence))
     return curves
 
 
