@@ -32,6 +32,8 @@ class Copyable:
 
     @property
     def time_limit(self) -> int:
-        """Steps after which an episode is over."""
+        """The steps of the longest episode: by the reference rules one more than the game's limit,
+        for there some games end a step late.
+        """
         game = self._batch.game
-        return int(game.max_steps + (game.rules == "reference"))  # whose ends come a step late
+        return int(game.max_steps + (game.rules == "reference"))

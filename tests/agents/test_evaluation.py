@@ -8,7 +8,13 @@ import torch
 from tensordict import TensorDict
 
 import arcade_torch
-from arcade_torch.agents.evaluation import evaluate, held_out_seed, make_env, make_eval_env
+from arcade_torch.agents.evaluation import (
+    EvalResult,
+    evaluate,
+    held_out_seed,
+    make_env,
+    make_eval_env,
+)
 from arcade_torch.agents.policy import make_policy
 from arcade_torch.agents.presets import preset
 from arcade_torch.models import make_network
@@ -93,21 +99,84 @@ def test_the_twin_can_be_chosen(env):
 
 
 class Lost(Clock):
-    """Decides by outputs, which are no numbers in the first two environments from step 5 on."""
+    """Decides by outputs, of which one is no number in the first two environments from step 5 on."""
+
+    name = "q_value"
 
     def act(self, obs, state):
         action, _, after = super().act(obs, state)
         values = torch.nn.functional.one_hot(action, 5).float()
-        values[:2] = values[:2].where(state["t"][:2, None] < 5, torch.nan)
-        return values.argmax(-1), {"q_value": values}, after
+        values[:2, 0] = values[:2, 0].where(~self.is_lost(obs, state)[:2], torch.nan)
+        return values.argmax(-1), {self.name: values}, after
+
+    def is_lost(self, obs, state):
+        return state["t"] >= 5
 
 
-def test_decisions_by_outputs_that_are_no_numbers_are_told(env):
+class LostLater(Lost):
+    """The same from its second episode on, in an environment that ends soon."""
+
+    def initial_state(self, batch_size):
+        self.episodes = torch.zeros(batch_size, dtype=torch.int64)
+        return super().initial_state(batch_size)
+
+    def is_lost(self, obs, state):
+        self.episodes += obs["is_init"].squeeze(-1)
+        return self.episodes > 1
+
+
+@pytest.mark.parametrize("name", ["q_value", "logits"])
+def test_decisions_by_outputs_that_are_no_numbers_are_told(name, env):
+    player = Lost()
+    player.name = name
     with pytest.warns(UserWarning, match=r"NaN in 2 of 6 episodes"):
-        assert len(evaluate(Lost(), env=env).returns) == 6
+        assert len(evaluate(player, env=env).returns) == 6
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         evaluate(Clock(), env=env)
+
+
+def test_what_comes_behind_the_first_episode_counts_nowhere(env):
+    """The last environments go on for so long that the first ones begin again, and end again."""
+
+    def one_sided(player):
+        class OneSided(player):
+            def act(self, obs, state):
+                action, extras, state = super().act(obs, state)
+                action[:2] = 2  # falls at once
+                return action, extras, state
+
+        return OneSided()
+
+    alone = evaluate(one_sided(Clock), seed=3, env=env)
+    assert alone.lengths[:2].max() * 2 < alone.lengths.max()
+    assert alone.lengths[:2].tolist() == lengths_of_the_first_fall()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        evaluate(one_sided(LostLater), seed=3, env=env)
+
+
+def lengths_of_the_first_fall():
+    """How long the first two poles stand where the cart is always pushed to one side."""
+    fresh = make_eval_env(preset("small", env="CartPoleEasy"), EPISODES)
+    fresh.set_seed(held_out_seed(3))
+    td = fresh.reset()
+    lengths = [0, 0]
+    for step in range(1, 60):
+        played, td = fresh.step_and_maybe_reset(
+            td.set("action", torch.full((EPISODES,), 2, dtype=torch.int64))
+        )
+        for i in range(2):
+            if not lengths[i] and played["next", "done"][i]:
+                lengths[i] = step
+    return lengths
+
+
+def test_the_episodes_of_a_mixture_are_told_apart_with_their_lengths():
+    returns, lengths = torch.arange(3.0).numpy(), torch.tensor([4, 5, 6]).numpy()
+    result = EvalResult(returns, lengths, ("a-v0", "b-v0", "a-v0"))
+    numbers = {game: (r.returns.tolist(), r.lengths.tolist()) for game, r in result.by_game.items()}
+    assert numbers == {"a-v0": ([0, 2], [4, 6]), "b-v0": ([1], [5])}
 
 
 def test_numbers_about_the_returns(env):

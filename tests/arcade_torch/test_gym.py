@@ -160,6 +160,39 @@ def test_the_vector_env_is_gymnasium_s_own_to_the_bit(mode: AutoresetMode) -> No
     assert kinds.all() and len(resets) == (2 if mode is AutoresetMode.DISABLED else 0)
 
 
+@pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
+def test_an_end_stands_until_its_own_env_begins_anew(mode: str) -> None:
+    envs = ArcadeVectorEnv("MineSweeperEasy", 3, autoreset_mode=mode)
+    envs.reset(seed=0)
+    ended = np.zeros(3, bool)
+    for action in random_actions(30, 3):  # before the time limit: a mine
+        ended = envs.step(action)[2]
+        if ended.any():
+            break
+    assert ended.any() and not ended.all()
+    envs.reset(options={"reset_mask": ~ended})
+    if mode == "Disabled":
+        with pytest.raises(ResetNeeded, match=rf"^envs \[{np.flatnonzero(ended)[0]}\] have ended"):
+            envs.step(np.zeros(3, int))
+    else:
+        _, rewards, _, _, infos = envs.step(np.zeros(3, int))
+        assert infos["step_count"].tolist() == np.where(ended, 0, 1).tolist()
+        assert (rewards[ended] == 0).all()
+
+
+@pytest.mark.parametrize("rules", ["default", "reference"])
+def test_the_time_limit_of_the_spec_is_the_step_that_truncates(rules: str) -> None:
+    # by the reference rules it comes a step late here, as in the longest episode of some others
+    env = gymnasium.make("arcade_torch/AutoEncodeEasy-v0", rules=rules)
+    env.reset(seed=0)
+    steps, truncated = 0, False
+    while not truncated:
+        _, _, _, truncated, _ = env.step(0)
+        steps += 1
+    assert env.spec is not None and env.spec.max_episode_steps == steps
+    assert env.unwrapped.time_limit == steps  # type: ignore[attr-defined]
+
+
 @pytest.mark.parametrize("mode", MODES, ids=[mode.value for mode in MODES])
 def test_what_was_handed_out_never_changes(mode: AutoresetMode) -> None:
     envs = ArcadeVectorEnv("MineSweeperEasy", 3, autoreset_mode=mode)
