@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from arcade_torch.tools import cli
-from arcade_torch.tools.bench.registry import TABLES, compare, page, read_results
+from arcade_torch.tools.bench.registry import SIZES, TABLES, compare, page, read_results
 from arcade_torch.tools.files import read_csv
 from tests.tools.test_cli import one_error
 
@@ -176,22 +176,10 @@ def test_a_file_from_before_settings_were_kept_is_compared(
 def test_a_benchmark_says_at_what_size_and_on_how_many_threads_it_ran(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = [
-        "bench",
-        "memory",
-        "gru",
-        "--steps",
-        "4",
-        "--layers",
-        "1",
-        "--size",
-        "8",
-        "--batch",
-        "2",
-        "--frames",
-        "4",
-    ]
-    words += ["--seconds", "0.001", "--repeats", "1"]
+    words = ["bench", "memory"]
+    for name, value in SIZES["tiny"]["memory"].items():
+        values = value if isinstance(value, tuple) else [value]
+        words += [f"--{name}", *map(str, values)]
     for threads in (1, 2):
         out = tmp_path / f"{threads}.json"
         assert cli.main([*words, "--threads", str(threads), "--out", str(out)]) == cli.EXIT_OK
@@ -203,7 +191,7 @@ def test_a_benchmark_says_at_what_size_and_on_how_many_threads_it_ran(
     table = tmp_path / "table.csv"
     assert cli.main([*words, "--out", str(table)]) == cli.EXIT_OK
     (row, *_) = read_csv(tmp_path / "table_models.csv")
-    assert (row["steps"], row["size"], row["batch"], row["threads"]) == ("4", "8", "2", "1")
+    assert (row["steps"], row["size"], row["batch"], row["threads"]) == ("8", "8", "2", "1")
 
 
 def test_a_tiny_benchmark_of_everything_is_written_read_and_equals_itself(

@@ -63,6 +63,7 @@ def test_the_benchmark_times_whole_parts_and_its_table_is_saved(
     assert float(row["learning: convolutions"]) > 0
     both = 1 / float(row["collect_fps"]) + 1 / float(row["learn_fps"])
     assert float(row["train_fps"]) == pytest.approx(1 / both, rel=1e-2)
+    assert row["threads"] == str(torch.get_num_threads()), "--threads 0 leaves the setting alone"
     shown = capsys.readouterr().out
     assert "train_fps" in shown and "threads" in shown
 

@@ -61,6 +61,8 @@ def test_an_interval_holds_its_confidence_and_both_ends_belong_to_it() -> None:
     draws = np.arange(101.0)
     assert percentile_interval(50, draws, 0.9) == pytest.approx((50, 5, 95))
     assert percentile_interval(50, draws, 0.5) == pytest.approx((50, 25, 75))
+    for nothing in (np.inf, np.nan):
+        assert np.isnan(percentile_interval(nothing, draws, 0.9)[1:]).all()
     for low, high in ((0.0, 0.6), (-0.6, 0.0), (-0.1, 0.1), (np.nan, np.nan)):
         assert not Interval(0.3, low, high).excludes_zero
     assert Interval(0.3, 0.1, 0.6).excludes_zero and Interval(-0.3, -0.6, -0.1).excludes_zero

@@ -10,7 +10,7 @@ such files.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -156,7 +156,9 @@ def measure(
 
 
 def _settings(options: BenchOptions) -> dict[str, Any]:
-    """Options as JSON has them, without the files they name and what the machine tells."""
+    """Options as JSON has them, without files, and without ``keep_memory``, which the machine's
+    line tells.
+    """
     settings = {}
     for name, value in vars(options).items():
         if name != "keep_memory" and not isinstance(value, Path):
@@ -187,7 +189,7 @@ def read_results(path: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is no file of `arcade-torch bench all` in format {FORMAT}")
     if not isinstance(values.get("machine"), dict) or not isinstance(values.get("size"), str):
         raise ValueError(f"{path} does not say on which machine and at what size it was measured")
-    settings = values.setdefault("settings", {})  # a file of 0.2.0 or earlier has none
+    settings = values.setdefault("settings", {})  # a file from before they were kept has none
     if not isinstance(settings, dict) or not all(isinstance(x, dict) for x in settings.values()):
         raise ValueError(f"{path}: settings must be a table of options for each benchmark")
     try:
@@ -235,21 +237,23 @@ def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
     """What of two files' machines, and of the settings of benchmarks that both have, is not the
     same: a line for each.
     """
-    lines = []
-    compared = [("machine", old["machine"], new["machine"], MACHINE)]
+    lines = [_difference("machine", old["machine"], new["machine"], MACHINE)]
     for name, was in old["settings"].items():
         if name in new["settings"]:
             now = new["settings"][name]
-            compared.append((f"settings of {name}", was, now, tuple(was | now)))
-    for subject, was, now, columns in compared:
-        differs = [
-            f"{column} {was.get(column)} and {now.get(column)}"
-            for column in columns
-            if was.get(column) != now.get(column)
-        ]
-        if differs:
-            lines.append(f"not the same {subject}: {', '.join(differs)}")
-    return lines
+            lines.append(_difference(f"settings of {name}", was, now, [*(was | now)]))
+    return [line for line in lines if line]
+
+
+def _difference(
+    subject: str, was: Mapping[str, Any], now: Mapping[str, Any], names: Sequence[str]
+) -> str:
+    """What of some names has another value, on one line; empty if nothing has."""
+    differs = []
+    for name in names:
+        if was.get(name) != now.get(name):
+            differs.append(f"{name} {was.get(name)} and {now.get(name)}")
+    return f"not the same {subject}: {', '.join(differs)}" if differs else ""
 
 
 def compare(

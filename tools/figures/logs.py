@@ -153,15 +153,14 @@ def curves_of_runs(
     curves = {}
     for task, runs in groups.items():
         histories = _histories(runs, kind)
-        if not histories:
-            continue
-        grid = _shared_frames(histories, kind)
+        grid = _shared_frames(histories, kind) if histories else np.empty(0)
         if not grid.size:
             continue
-        seeds = np.stack([np.interp(grid, *history) for history in histories])
+        seeds = [np.interp(grid, history.frames, history.values) for history in histories]
         # the mean of the other seeds would be that of another agent
-        seeds[:, ~np.isfinite(seeds).all(axis=0)] = np.nan
-        curves[task] = Curve(grid, pooled(list(seeds), confidence))
+        is_whole = np.isfinite(seeds).all(axis=0)
+        whole = [np.where(is_whole, returns, np.nan) for returns in seeds]
+        curves[task] = Curve(grid, pooled(whole, confidence))
     return curves
 
 

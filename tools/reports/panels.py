@@ -115,7 +115,8 @@ def curve_panels(
     panels = []
     for (game, twin), by_agent in style.agents_by_task(curves).items():
         means = levels.get(game, {})
-        inside = list(filter(math.isfinite, [*returns_of_game[game], *means.values()])) or [0.0]
+        returns = [*returns_of_game[game], *means.values()]
+        inside = [value for value in returns if math.isfinite(value)] or [0.0]
         low = min(inside)
         high = max(inside)
         margin = 0.07 * (high - low) or 0.5
