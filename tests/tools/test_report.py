@@ -186,9 +186,10 @@ def test_a_run_without_a_score_is_not_averaged_away(
     file = path / "eval.json"
     changes = {"mean": score, "returns": [score, 0.5]}
     file.write_text(json.dumps(json.loads(file.read_text()) | changes))
-    *evaluations, last = (path / "eval.csv").read_text().splitlines()
-    last = f"{last.partition(',')[0]},{score},nan,128"
-    (path / "eval.csv").write_text("\n".join([*evaluations, last, ""]))
+    lines = (path / "eval.csv").read_text().splitlines()
+    for place in (1, -1):  # the first evaluation and the last
+        lines[place] = f"{lines[place].partition(',')[0]},{score},nan,128"
+    (path / "eval.csv").write_text("\n".join([*lines, ""]))
     parts = ("saliency", "recall", "counterfactual", "beliefs", "contamination")
     page = report(folder.root, skip=parts).read_text()
     assert f"is {score}" in page  # in the place of gap and bias
@@ -197,7 +198,7 @@ def test_a_run_without_a_score_is_not_averaged_away(
     curves = curves_of_runs(find_runs([folder.root]).groups())
     with_it = curves["mingru", "MineSweeperEasy", "full"].returns.mean
     without = curves["mingru", "MineSweeperEasy", "partial"].returns.mean
-    assert np.isfinite(with_it).tolist() == [True, True, True, True, False]
+    assert np.isfinite(with_it).tolist() == [False, True, True, True, False]
     assert np.isfinite(without).all()
 
 
@@ -274,6 +275,8 @@ def test_the_way_from_random_to_oracle_is_a_share() -> None:
     )
     assert "mlp 25 %" in said and "a seed of mlp did not get above random" in said
     assert findings.learning_sentence("X", "full", {"mlp": [0.1]}, {}) == ""
+    for nothing in (math.nan, math.inf, -math.inf):
+        assert findings.way(nothing, {"random": 0.0, "state": 1.0}) is None
 
 
 def test_equal_returns_of_oracle_and_random_player_divide_by_nothing(
