@@ -2,7 +2,6 @@
 
 from typing import TYPE_CHECKING, Any
 
-import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -17,8 +16,6 @@ if TYPE_CHECKING:
     from arcade_torch.agents.layout import NetworkInputs
 
 Key = str | tuple[str, ...]
-MASKS: tuple[Key, ...] = ("mask", ("collector", "mask"))
-"""Where TorchRL says which steps are no padding."""
 
 
 def entry(batch: TensorDictBase, key: Key) -> Tensor:
@@ -57,18 +54,6 @@ def is_prepared(batch: TensorDictBase) -> bool:
     an entry of that.
     """
     return isinstance(batch.get("extended", None), TensorDictBase) and "position" in batch
-
-
-def step_mask(batch: TensorDictBase, shape: torch.Size) -> Tensor | None:
-    """Which steps are no padding, bool of this shape [..., L]; None if the batch does not say."""
-    masks = []
-    for key in MASKS:
-        mask = batch.get(key, None)
-        if isinstance(mask, Tensor) and mask.shape in (shape, (*shape, 1)):
-            masks.append(mask.reshape(shape).bool())
-    if not masks:
-        return None
-    return masks[0] & masks[-1]
 
 
 def with_mask(batch: TensorDictBase, mask: Tensor | None) -> TensorDictBase:

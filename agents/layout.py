@@ -25,9 +25,9 @@ from arcade_torch.agents.batch_checks import (
     flat,
     is_stock,
     loads_at_starts,
-    step_mask,
     written,
 )
+from arcade_torch.models.memory import step_mask
 from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.rollout_buffer import final_key

@@ -22,7 +22,6 @@ from arcade_torch.agents.batch_checks import (
     Key,
     entry,
     one_a_step,
-    step_mask,
     stored_numbers,
     with_mask,
     written,
@@ -35,6 +34,7 @@ from arcade_torch.agents.network_loss import NetworkLoss, Reduction, check_actor
 from arcade_torch.agents.policy import make_actor
 from arcade_torch.agents.returns import SequenceGAE, normalize
 from arcade_torch.envs_jax.validation import plain
+from arcade_torch.models.memory import step_mask
 
 
 def ppo_objective(

@@ -13,8 +13,8 @@ from torch.nn import functional as F
 
 from arcade_torch.models.arguments import check_sizes, is_whole
 from arcade_torch.models.encoders import Encoder
-from arcade_torch.models.memory import batch_shape, first_state, replay
-from arcade_torch.models.recurrence import Key, Recurrence, Store, padding_mask
+from arcade_torch.models.memory import batch_shape, first_state, replay, step_mask
+from arcade_torch.models.recurrence import Key, Recurrence, Store
 from arcade_torch.models.registry import make_memory
 
 if TYPE_CHECKING:
@@ -310,7 +310,7 @@ class MemoryNetwork(TensorDictModuleBase):
             x = self._append(x, tensordict["last_action"], is_init)
         y = self.recurrence.read(self.block, tensordict, x)
         if self.predictor is not None and self.recurrence.recurrent_mode:
-            mask = padding_mask(tensordict, tensordict.batch_size)
+            mask = step_mask(tensordict, tensordict.batch_size)
             tensordict.set("prediction_error", self.prediction_error(x, y, is_init, mask))
         for name, value in self.by_head(self.head(y)).items():
             tensordict.set(name, value)
