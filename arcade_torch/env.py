@@ -3,13 +3,13 @@ JAX wrote.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import jax
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Composite
 
 from arcade_torch import default_seeds, validation
 from arcade_torch.base_env import BaseEnv
@@ -42,9 +42,8 @@ from arcade_torch.snapshot import Snapshots
 from arcade_torch.specs import make_specs
 
 
-@dataclass
-class Live:
-    """Where the episodes are. Beside the env, for ``nn.Module`` sets attributes slowly."""
+class Live(NamedTuple):
+    """Where the episodes are."""
 
     batch: Batch  # without flags of an end
     ended: Ended
@@ -133,36 +132,46 @@ class ArcadeEnv(BaseEnv):
         self._state_in_td = state_in_td
         self._task = torch.from_numpy(self._batched.task(num_envs)).to(torch_device)
         self.task_in_td = len(self.games) > 1 if task_in_td is None else task_in_td
-        wait_for_torch(torch_device, jax_device)
-        keys = self._keys(0)
-        partial = jax.device_put(flags, jax_device)
-        with jax.default_device(jax_device):
-            blank = jax.device_put(self._batched.blank(keys, partial), jax_device)
-        # what every reset runs: to begin by ``init`` would compile the game's reset once more
-        first, _ = self._batched.reset_render(blank, np.ones(num_envs, np.bool_))
         self._no_ends = torch.zeros(num_envs, 2, dtype=torch.bool, device=torch_device)
         no = jax.device_put(np.zeros(num_envs, np.bool_), jax_device)
         self._none_ended: Ended = (no, no)
-        self._live = Live(first, self._none_ended, self._no_ends)
+        self._live = Live(self._first_batch(flags), self._none_ended, self._no_ends)
         shape = (num_envs, self.game.obs_size, self.game.obs_size, 3)
         self._memory = FrameMemory(shape, jax_device)
-        self._ends = FrameMemory(shape, jax_device)
+        self._final_memory = FrameMemory(shape, jax_device)
         self._snapshots = Snapshots(self._batched, self._with_ends(), torch_device, jax_device)
+        self._set_specs()
+        self._begun = False
+        self._set_seed(seed)
+
+    def _first_batch(self, partial: np.ndarray) -> Batch:
+        """Episodes that begin, of the twins ``partial`` (bool [N])."""
+        wait_for_torch(self.device, self._jax_device)
+        keys = self._keys(0)
+        flags = jax.device_put(partial, self._jax_device)
+        with jax.default_device(self._jax_device):
+            blank = jax.device_put(self._batched.blank(keys, flags), self._jax_device)
+        # what every reset runs: to begin by ``init`` would compile the game's reset once more
+        first: Batch = self._batched.reset_render(blank, np.ones(self.num_envs, np.bool_))[0]
+        return first
+
+    def _set_specs(self) -> None:
+        """Tell TorchRL what the entries are."""
+        game = self.game
         tasks = len(self.games) if self.task_in_td else 0
         action, observation, reward, done = make_specs(
-            num_envs, self.game.obs_size, self.game.num_actions, tasks, self.one_hot, torch_device
+            self.num_envs, game.obs_size, game.num_actions, tasks, self.one_hot, self.device
         )
         self.action_spec = action
         self.reward_spec = reward
         self.done_spec = done
-        if state_in_td:
-            observation["state"] = self._snapshots.spec()
-            self.state_spec = type(observation)(
-                state=self._snapshots.spec(), shape=(num_envs,), device=torch_device
+        if self._state_in_td:
+            state = self._snapshots.spec()
+            observation["state"] = state
+            self.state_spec = Composite(
+                state=state.clone(), shape=(self.num_envs,), device=self.device
             )
         self.observation_spec = observation
-        self._begun = False
-        self._set_seed(seed)
 
     @property
     def game(self) -> Game[Any] | Mixture:
@@ -232,10 +241,9 @@ class ArcadeEnv(BaseEnv):
         """
         flags = changed_flags(observability, self.num_envs)
         wait_for_torch(self.device, self._jax_device)
-        self._live.batch = self._live.batch._replace(
-            partial=jax.device_put(flags, self._jax_device)
-        )
-        self._live.view += 1
+        partial = jax.device_put(flags, self._jax_device)
+        live = self._live
+        self._live = live._replace(batch=live.batch._replace(partial=partial), view=live.view + 1)
 
     def get_state(self) -> TensorDict:
         """Copy everything that determines the future: game states, random keys, observability,
@@ -380,9 +388,8 @@ class ArcadeEnv(BaseEnv):
         """
         ended = self._none_ended if ended is None else ended
         ends = self._no_ends if ends is None else ends
-        vars(self._live).update(
-            batch=batch, ended=ended, ends=ends, generation=self._live.generation + 1
-        )
+        live = Live(batch, ended, ends, self._live.generation + 1, self._live.view)
+        self.__dict__["_live"] = live  # ``nn.Module`` sets attributes slowly
 
     def _go_on_from(
         self,
@@ -461,7 +468,7 @@ class ArcadeEnv(BaseEnv):
             self._go_on_from(tensordict.get("state", None), partial=self._live.batch.partial)
         action = self._integers(validation.tensor(tensordict, "action"))
         argument = int32_argument(action, self._jax_device)
-        before = Live(self._live.batch, self._live.ended, self._live.ends)
+        before = self._live
         batch, ended, pixels, packed = self._compiled.step_only(
             before.batch, before.ended, argument, self._memory.spare()
         )
@@ -478,13 +485,13 @@ class ArcadeEnv(BaseEnv):
         return following
 
     def _only_marked(
-        self, tensordict: TensorDictBase, before: "Live", following: TensorDict
+        self, tensordict: TensorDictBase, before: Live, following: TensorDict
     ) -> TensorDictBase:
         """Take the step back in envs that ``_step`` leaves out: ``"next"`` repeats their root, the
         reward is 0.
         """
         marked = validation.mask(tensordict, "_step", self.num_envs)
-        stepped = Live(self._live.batch, self._live.ended, self._live.ends)
+        stepped = self._live
         # where it stays if the next line refuses
         self._go_on(before.batch, before.ended, before.ends)
         validation.check_merge(tensordict, following)
@@ -510,14 +517,15 @@ class ArcadeEnv(BaseEnv):
         following = self._next(raw.pixels, last_action, raw.numbers)
         # all envs are drawn again, which is no dearer than to copy their frames
         if following["done"].any():
-            ended = self._live.batch._replace(state=raw.final[0])
-            drawn = self._ends.show(self._compiled.draw(ended, self._ends.spare()))
-            following._set_str("pixels", to_torch(drawn, self.device), **_UNCHECKED)
+            at_ends = self._live.batch._replace(state=raw.final[0])
+            drawn = self._compiled.draw(at_ends, self._final_memory.spare())
+            final_frames = to_torch(self._final_memory.show(drawn), self.device)
+            following._set_str("pixels", final_frames, **_UNCHECKED)
         validation.keep_what_was_written(tensordict, following)
         tensordict.set("next", following)
         root: TensorDictBase = self._step_mdp(tensordict)
         counts = raw.root_numbers(("is_init", "step_count", "episode_reward"))
-        ends = torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
+        ends = self._no_ends.clone()  # it is handed out
         for key, value in self._entries(raw.pixels, last_action, counts, ends).items():
             root._set_str(key, value, **_UNCHECKED)
         return tensordict, root
