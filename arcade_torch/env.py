@@ -144,35 +144,6 @@ class ArcadeEnv(BaseEnv):
         self._begun = False
         self._set_seed(seed)
 
-    def _first_batch(self, partial: np.ndarray) -> Batch:
-        """Episodes that begin, of the twins ``partial`` (bool [N])."""
-        wait_for_torch(self.device, self._jax_device)
-        keys = self._keys(0)
-        flags = jax.device_put(partial, self._jax_device)
-        with jax.default_device(self._jax_device):
-            blank = jax.device_put(self._batched.blank(keys, flags), self._jax_device)
-        # what every reset runs: to begin by ``init`` would compile the game's reset once more
-        first: Batch = self._batched.reset_render(blank, np.ones(self.num_envs, np.bool_))[0]
-        return first
-
-    def _set_specs(self) -> None:
-        """Tell TorchRL what the entries are."""
-        game = self.game
-        tasks = len(self.games) if self.task_in_td else 0
-        action, observation, reward, done = make_specs(
-            self.num_envs, game.obs_size, game.num_actions, tasks, self.one_hot, self.device
-        )
-        self.action_spec = action
-        self.reward_spec = reward
-        self.done_spec = done
-        if self._state_in_td:
-            state = self._snapshots.spec()
-            observation["state"] = state
-            self.state_spec = Composite(
-                state=state.clone(), shape=(self.num_envs,), device=self.device
-            )
-        self.observation_spec = observation
-
     @property
     def game(self) -> Game[Any] | Mixture:
         """The game that is played, or what the games have in common: id, limits of steps and
@@ -374,70 +345,60 @@ class ArcadeEnv(BaseEnv):
         """
         return FinalObservations(self._compiled, self.num_envs, max_steps, self._jax_device)
 
-    def _go_on(
-        self, batch: Batch, ended: Ended | None = None, ends: torch.Tensor | None = None
-    ) -> None:
-        """Put another state in place, all at once: an interrupt leaves the old state or the new
-        one.
-
-        Args:
-            batch: Without flags of an end.
-            ended: Where it has ended; None: nowhere.
-            ends: bool [N, 2], what a root says of that: where its last step terminated or
-                truncated; None: nowhere.
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> Any:
+        """Seed the batch, see TorchRL's `EnvBase`; a number of numpy or torch will do, of which
+        TorchRL alone makes no next seed.
         """
-        ended = self._none_ended if ended is None else ended
-        ends = self._no_ends if ends is None else ends
-        live = Live(batch, ended, ends, self._live.generation + 1, self._live.view)
-        self.__dict__["_live"] = live  # ``nn.Module`` sets attributes slowly
+        return super().set_seed(plain(seed), static_seed)
 
-    def _go_on_from(
-        self,
-        state: TensorDictBase | None,
-        ends: torch.Tensor | None = None,
-        partial: jax.Array | None = None,
-    ) -> None:
-        """Put a snapshot in place; ``partial`` (bool [N]) says which twins to show in its place."""
-        batch = self._snapshots.load(state)
-        if partial is not None:
-            batch = batch._replace(partial=partial)
-        terminated, truncated = self._batched.ends(batch)
-        some_ended = np.asarray(terminated).any() or np.asarray(truncated).any()
-        ended = (terminated, truncated) if some_ended else None
-        self._go_on(self._batched.without_ends(batch), ended, ends)
-
-    def _still_ended(self, rows: np.ndarray) -> Ended:
-        """Where, of the envs ``rows`` (bool [N]), the live batch has ended."""
-        terminated = self._live.ended[0] & rows
-        truncated = self._live.ended[1] & rows
-        # Fused steps are faster where none has; but a look at memory of a GPU would wait for it.
-        if is_host(self.device) and not (np.asarray(terminated) | np.asarray(truncated)).any():
-            return self._none_ended
-        return terminated, truncated
-
-    def _with_ends(self) -> Batch:
-        """The live batch with the flags of an end."""
-        return self._flagged(self._live.batch, self._live.ended)
-
-    def _flagged(self, batch: Batch, ended: Ended) -> Batch:
-        """A batch with the flags of an end; those that a mixture adds are made where the env is."""
+    def _first_batch(self, partial: np.ndarray) -> Batch:
+        """Episodes that begin, of the twins ``partial`` (bool [N])."""
+        wait_for_torch(self.device, self._jax_device)
+        keys = self._keys(0)
+        flags = jax.device_put(partial, self._jax_device)
         with jax.default_device(self._jax_device):
-            return self._batched.with_ends(batch, *ended)
+            blank = jax.device_put(self._batched.blank(keys, flags), self._jax_device)
+        # what every reset runs: to begin by ``init`` would compile the game's reset once more
+        first: Batch = self._batched.reset_render(blank, np.ones(self.num_envs, np.bool_))[0]
+        return first
 
-    def _integers(self, action: torch.Tensor) -> torch.Tensor:
-        """The actions as integers [N]; raises if they are not what the spec says, or in a process
-        that cannot step.
+    def _set_specs(self) -> None:
+        """Tell TorchRL what the entries are."""
+        game = self.game
+        tasks = len(self.games) if self.task_in_td else 0
+        action, observation, reward, done = make_specs(
+            self.num_envs, game.obs_size, game.num_actions, tasks, self.one_hot, self.device
+        )
+        self.action_spec = action
+        self.reward_spec = reward
+        self.done_spec = done
+        if self._state_in_td:
+            state = self._snapshots.spec()
+            observation["state"] = state
+            self.state_spec = Composite(
+                state=state.clone(), shape=(self.num_envs,), device=self.device
+            )
+        self.observation_spec = observation
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Give every env a new random key and forget the last action; running episodes go on until
+        they are reset.
         """
-        check_process()
-        num_actions = self.game.num_actions
-        if self.one_hot:
-            validation.check_one_hot(action, (self.num_envs, num_actions), self._check_actions)
-            return action.to(torch.float32).argmax(-1)
-        validation.check_integers(action, self.num_envs, num_actions, self._check_actions)
-        return action
+        if seed is None:
+            seed = int(torch.randint(2**32, (), device="cpu"))
+        default_seeds.forget(self)
+        wait_for_torch(self.device, self._jax_device)
+        key = self._keys(seed)
+        last_action = jax.device_put(np.zeros(self.num_envs, np.int32), self._jax_device)
+        seeded = self._live.batch._replace(key=key, last_action=last_action)
+        self._go_on(seeded, self._live.ended, self._live.ends)
 
-    def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
-        validation.check_tensordict(tensordict, self.num_envs)
+    def _keys(self, seed: int) -> jax.Array:
+        """The random keys of a seed, uint32 [N, 2]; computed where the env is, too."""
+        with jax.default_device(self._jax_device):
+            computed = env_keys(seed, self.num_envs)
+        keys: jax.Array = jax.device_put(computed, self._jax_device)
+        return keys
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
@@ -530,31 +491,70 @@ class ArcadeEnv(BaseEnv):
             root._set_str(key, value, **_UNCHECKED)
         return tensordict, root
 
-    def _keys(self, seed: int) -> jax.Array:
-        """The random keys of a seed, uint32 [N, 2]; computed where the env is, too."""
+    def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
+        validation.check_tensordict(tensordict, self.num_envs)
+
+    def _integers(self, action: torch.Tensor) -> torch.Tensor:
+        """The actions as integers [N]; raises if they are not what the spec says, or in a process
+        that cannot step.
+        """
+        check_process()
+        num_actions = self.game.num_actions
+        if self.one_hot:
+            validation.check_one_hot(action, (self.num_envs, num_actions), self._check_actions)
+            return action.to(torch.float32).argmax(-1)
+        validation.check_integers(action, self.num_envs, num_actions, self._check_actions)
+        return action
+
+    def _go_on(
+        self, batch: Batch, ended: Ended | None = None, ends: torch.Tensor | None = None
+    ) -> None:
+        """Put another state in place, all at once: an interrupt leaves the old state or the new
+        one.
+
+        Args:
+            batch: Without flags of an end.
+            ended: Where it has ended; None: nowhere.
+            ends: bool [N, 2], what a root says of that: where its last step terminated or
+                truncated; None: nowhere.
+        """
+        ended = self._none_ended if ended is None else ended
+        ends = self._no_ends if ends is None else ends
+        live = Live(batch, ended, ends, self._live.generation + 1, self._live.view)
+        self.__dict__["_live"] = live  # ``nn.Module`` sets attributes slowly
+
+    def _go_on_from(
+        self,
+        state: TensorDictBase | None,
+        ends: torch.Tensor | None = None,
+        partial: jax.Array | None = None,
+    ) -> None:
+        """Put a snapshot in place; ``partial`` (bool [N]) says which twins to show in its place."""
+        batch = self._snapshots.load(state)
+        if partial is not None:
+            batch = batch._replace(partial=partial)
+        terminated, truncated = self._batched.ends(batch)
+        some_ended = np.asarray(terminated).any() or np.asarray(truncated).any()
+        ended = (terminated, truncated) if some_ended else None
+        self._go_on(self._batched.without_ends(batch), ended, ends)
+
+    def _still_ended(self, rows: np.ndarray) -> Ended:
+        """Where, of the envs ``rows`` (bool [N]), the live batch has ended."""
+        terminated = self._live.ended[0] & rows
+        truncated = self._live.ended[1] & rows
+        # Fused steps are faster where none has; but a look at memory of a GPU would wait for it.
+        if is_host(self.device) and not (np.asarray(terminated) | np.asarray(truncated)).any():
+            return self._none_ended
+        return terminated, truncated
+
+    def _with_ends(self) -> Batch:
+        """The live batch with the flags of an end."""
+        return self._flagged(self._live.batch, self._live.ended)
+
+    def _flagged(self, batch: Batch, ended: Ended) -> Batch:
+        """A batch with the flags of an end; those that a mixture adds are made where the env is."""
         with jax.default_device(self._jax_device):
-            computed = env_keys(seed, self.num_envs)
-        keys: jax.Array = jax.device_put(computed, self._jax_device)
-        return keys
-
-    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> Any:
-        """Seed the batch, see TorchRL's `EnvBase`; a number of numpy or torch will do, of which
-        TorchRL alone makes no next seed.
-        """
-        return super().set_seed(plain(seed), static_seed)
-
-    def _set_seed(self, seed: int | None) -> None:
-        """Give every env a new random key and forget the last action; running episodes go on until
-        they are reset.
-        """
-        if seed is None:
-            seed = int(torch.randint(2**32, (), device="cpu"))
-        default_seeds.forget(self)
-        wait_for_torch(self.device, self._jax_device)
-        key = self._keys(seed)
-        last_action = jax.device_put(np.zeros(self.num_envs, np.int32), self._jax_device)
-        seeded = self._live.batch._replace(key=key, last_action=last_action)
-        self._go_on(seeded, self._live.ended, self._live.ends)
+            return self._batched.with_ends(batch, *ended)
 
     def _root(self, batch: Batch, ended: Ended, frames: torch.Tensor) -> TensorDict:
         """Root tensordict of a live batch and of where it has ended.
