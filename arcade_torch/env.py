@@ -273,8 +273,8 @@ class ArcadeEnv(BaseEnv):
 
     @property
     def generation(self) -> tuple[int, int]:
-        """Changes of the state (steps, resets, loads) and of the observability, so that a collector
-        notices others'.
+        """How often the state (by steps, resets, loads) and the observability have changed, so that
+        a collector notices changes that it has not made.
         """
         return self._live.generation, self._live.view
 
@@ -334,21 +334,17 @@ class ArcadeEnv(BaseEnv):
         return ("pixels",)
 
     def draws_safely(self) -> bool:
-        """Whether steps may draw into memory that tensors lie over: a step that fails would take it
-        along.
+        """Whether steps may draw into memory that tensors lie over. Not where a step calls code of
+        the game that may fail: the memory would be lost with the step.
         """
         return not self._compiled.calls_back(self._live.batch)
 
     def final_observations(self, max_steps: int) -> FinalObservations:
-        """Something that keeps the states of up to ``max_steps`` steps, and draws the ends among
-        them when asked.
-        """
+        """A store for the states of up to ``max_steps`` steps; draws the final ones when asked."""
         return FinalObservations(self._compiled, self.num_envs, max_steps, self._jax_device)
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> Any:
-        """Seed the batch, see TorchRL's `EnvBase`; a number of numpy or torch will do, of which
-        TorchRL alone makes no next seed.
-        """
+        """Seed the batch, see TorchRL's `EnvBase`; ``seed`` may be of numpy or torch too."""
         return super().set_seed(plain(seed), static_seed)
 
     def _first_batch(self, partial: np.ndarray) -> Batch:
@@ -529,7 +525,13 @@ class ArcadeEnv(BaseEnv):
         ends: torch.Tensor | None = None,
         partial: jax.Array | None = None,
     ) -> None:
-        """Put a snapshot in place; ``partial`` (bool [N]) says which twins to show in its place."""
+        """Put a snapshot in place.
+
+        Args:
+            state: The snapshot.
+            ends: See ``_go_on``.
+            partial: bool [N], the twins to show; None: those of the snapshot.
+        """
         batch = self._snapshots.load(state)
         if partial is not None:
             batch = batch._replace(partial=partial)
@@ -578,7 +580,7 @@ class ArcadeEnv(BaseEnv):
         self, frames: torch.Tensor, action: torch.Tensor, numbers: torch.Tensor
     ) -> TensorDict:
         """The ``"next"`` tensordict. Frames are zero copy, since JAX never reads them again.
-        Rewards are copies, for ``consolidate`` of a tensordict takes no columns.
+        Rewards are copies: ``consolidate`` of a tensordict does not work with columns.
         """
         is_init = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         step_count = numbers[:, STEP_COUNT, None].to(torch.int64)
