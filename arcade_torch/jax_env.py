@@ -203,41 +203,6 @@ class JaxEnv(BaseEnv):
         """A store for the observations that steps led to, before the resets."""
         return KeptObservations(self._obs_names)
 
-    def _go_on(self, live: Episodes, ends: torch.Tensor | None = None) -> None:
-        """Put another state in place, all at once.
-
-        Args:
-            live: The episodes.
-            ends: bool [N, 2], where they have terminated or been truncated and wait for a reset;
-                None: nowhere.
-        """
-        # ``nn.Module`` sets attributes slowly, and one by one
-        self.__dict__.update(_live=live, _ends=ends, _count=self._count + 1)
-
-    def _ended(self) -> torch.Tensor:
-        """bool [N, 2], where episodes have terminated or been truncated and wait for a reset."""
-        if self._ends is not None:
-            return self._ends.clone()
-        return torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
-
-    def _waits_for_reset(self) -> bool:
-        """Whether an episode may have ended that was not reset; on a GPU nobody waits to see."""
-        return self._ends is not None and (not is_host(self.device) or bool(self._ends.any()))
-
-    def _stay_at_ends(self, after: Episodes, outcome: Outcome) -> tuple[Episodes, Outcome]:
-        """Take a step back where an episode had ended before it: there the flags are those of the
-        end, and the reward is 0.
-        """
-        ends = self._ended()
-        ended = jax.device_put(ends.any(1).cpu().numpy(), self._jax_device)
-        terminated, truncated = jax.device_put(ends.T.cpu().numpy(), self._jax_device)
-        at_end = Outcome(jnp.zeros_like(outcome.reward), terminated, truncated)
-        stays: tuple[Episodes, Outcome] = choose_rows(ended, (self._live, at_end), (after, outcome))
-        return stays
-
-    def _flag(self) -> Categorical:
-        return Categorical(2, shape=(self.num_envs, 1), dtype=torch.bool, device=self.device)
-
     def _observation_spec(self) -> Composite:
         """The spec of everything but action, reward and ends."""
         shape = (self.num_envs, 1)
@@ -253,6 +218,9 @@ class JaxEnv(BaseEnv):
         spec["step_count"] = Unbounded(shape, dtype=torch.int64, device=self.device)
         spec["episode_reward"] = Unbounded(shape, dtype=torch.float32, device=self.device)
         return spec
+
+    def _flag(self) -> Categorical:
+        return Categorical(2, shape=(self.num_envs, 1), dtype=torch.bool, device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:
         """Draw all episodes anew."""
@@ -324,6 +292,38 @@ class JaxEnv(BaseEnv):
         if is_host(self._jax_device):
             return action.detach().to("cpu", dtype, copy=True).numpy()
         return to_jax(action.detach().to(dtype, copy=True))
+
+    def _go_on(self, live: Episodes, ends: torch.Tensor | None = None) -> None:
+        """Put another state in place, all at once.
+
+        Args:
+            live: The episodes.
+            ends: bool [N, 2], where they have terminated or been truncated and wait for a reset;
+                None: nowhere.
+        """
+        # ``nn.Module`` sets attributes slowly, and one by one
+        self.__dict__.update(_live=live, _ends=ends, _count=self._count + 1)
+
+    def _ended(self) -> torch.Tensor:
+        """bool [N, 2], where episodes have terminated or been truncated and wait for a reset."""
+        if self._ends is not None:
+            return self._ends.clone()
+        return torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
+
+    def _waits_for_reset(self) -> bool:
+        """Whether an episode may have ended that was not reset; on a GPU nobody waits to see."""
+        return self._ends is not None and (not is_host(self.device) or bool(self._ends.any()))
+
+    def _stay_at_ends(self, after: Episodes, outcome: Outcome) -> tuple[Episodes, Outcome]:
+        """Take a step back where an episode had ended before it: there the flags are those of the
+        end, and the reward is 0.
+        """
+        ends = self._ended()
+        ended = jax.device_put(ends.any(1).cpu().numpy(), self._jax_device)
+        terminated, truncated = jax.device_put(ends.T.cpu().numpy(), self._jax_device)
+        at_end = Outcome(jnp.zeros_like(outcome.reward), terminated, truncated)
+        stays: tuple[Episodes, Outcome] = choose_rows(ended, (self._live, at_end), (after, outcome))
+        return stays
 
     def _root(self) -> TensorDict:
         """The root tensordict of the live episodes."""
