@@ -20,6 +20,7 @@ from torchrl.objectives.utils import dispatch_value_estimator
 
 from arcade_torch.agents.batch_checks import (
     Key,
+    NetworkInputs,
     entry,
     one_a_step,
     stored_numbers,
@@ -28,7 +29,7 @@ from arcade_torch.agents.batch_checks import (
 )
 from arcade_torch.agents.checked import Finite, Positive, coerce, require
 from arcade_torch.agents.config import PPOConfig, TimeLimit
-from arcade_torch.agents.layout import NetworkInputs, as_steps
+from arcade_torch.agents.layout import as_steps
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.network_loss import NetworkLoss, Reduction, check_actor
 from arcade_torch.agents.policy import make_actor

@@ -16,10 +16,10 @@ from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
-from arcade_torch.agents.batch_checks import Key, is_prepared, is_stock, with_mask
+from arcade_torch.agents.batch_checks import Key, NetworkInputs, is_prepared, is_stock, with_mask
 from arcade_torch.agents.checked import CountOrZero, coerce, require
 from arcade_torch.agents.config import Bootstrap, PQNConfig, TimeLimit
-from arcade_torch.agents.layout import NetworkInputs, insert_final_observations, unroll
+from arcade_torch.agents.layout import insert_final_observations, unroll
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.network_loss import NetworkLoss, Reduction
 from arcade_torch.agents.returns import QLambdaEstimator
