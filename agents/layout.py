@@ -178,8 +178,7 @@ def _final_places(batch: TensorDictBase, needed: Tensor) -> tuple[Tensor, Tensor
     if missing:
         raise ValueError(
             "next observations must be stored where needed: collect with final_frames='truncated' "
-            "or 'all', "
-            f"or take time_limit='terminal'; got {missing} missing"
+            f"or 'all', or take time_limit='terminal'; got {missing} missing"
         )
     return final_steps, used
 
