@@ -368,6 +368,15 @@ class ArcadeCollector(BaseCollector):
         first = TERMINATED if self._final_frames == "all" else TRUNCATED
         return not is_host(numbers.device) or bool(numbers.numpy()[:, first:].any())
 
+    def _begin_trajectories(self) -> None:
+        """Give the episodes of all envs new numbers."""
+        first = self._next_traj_id
+        self._next_traj_id = first + self._num_envs
+        self._traj_ids = torch.arange(
+            first, self._next_traj_id, dtype=torch.int64, device=self.env.device
+        )
+        self._numbered = self._iter  # the last window whose episodes were numbered
+
     def _trajectories(self, buffer: RolloutBuffer) -> torch.Tensor:
         """Episode numbers int64 [N, T] of the new steps, as TorchRL's collectors count them.
 
@@ -381,15 +390,6 @@ class ArcadeCollector(BaseCollector):
         self._traj_ids = ids[-1].clone()
         self._next_traj_id += int(done.sum())
         return ids[:-1].T.contiguous()
-
-    def _begin_trajectories(self) -> None:
-        """Give the episodes of all envs new numbers."""
-        first = self._next_traj_id
-        self._next_traj_id = first + self._num_envs
-        self._traj_ids = torch.arange(
-            first, self._next_traj_id, dtype=torch.int64, device=self.env.device
-        )
-        self._numbered = self._iter  # the last window whose episodes were numbered
 
     def set_seed(self, seed: int, static_seed: bool = False) -> int:
         """Seed env and random actions, and start over with new episodes.
