@@ -122,8 +122,8 @@ class PQNLoss(NetworkLoss):
         self._default_value_estimator()
 
     def _set_in_keys(self) -> None:
-        """Set ``in_keys`` to the entries that every batch holds, in the order that the loss takes
-        plain tensors. Who wants another order assigns it after the names are set.
+        """Set ``in_keys`` to the entries that every batch holds; plain tensors are taken in this
+        order. Who wants another order assigns it after the names are set.
         """
         keys = self.tensor_keys
         roots = dict.fromkeys(
