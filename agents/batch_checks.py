@@ -1,8 +1,7 @@
-"""Which layout a batch has, which of its steps count, and what no loss can read."""
+"""What a network reads of a batch, which layout that has, and what no loss can read."""
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
@@ -12,13 +11,32 @@ from arcade_torch.agents.checked import require
 from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.networks import MemoryNetwork
-
-if TYPE_CHECKING:
-    from arcade_torch.agents.layout import NetworkInputs
+from arcade_torch.rollout_buffer import final_key
 
 Key = str | tuple[str, ...]
-MASKS: tuple[Key, ...] = ("mask", ("collector", "mask"))
-"""Where TorchRL says which steps are no padding."""
+
+
+class NetworkInputs:
+    """Which entries of a batch a TensorDict module reads; a key that it also writes under "next" is
+    recurrent state.
+    """
+
+    def __init__(self, network: TensorDictModuleBase) -> None:
+        check_module(network)
+        check_state_keys(network)
+        keys = [unravel_key(key) for key in network.in_keys]
+        outputs = {unravel_key(key) for key in network.out_keys}
+        self.state_keys = [key for key in keys if unravel_key(("next", key)) in outputs]
+        self.observation_keys = [key for key in keys if key not in self.state_keys]
+        self.final_keys = {key: final_key(key) for key in keys}
+        self.stores = set()
+        self.start_keys: set[Key] = {"is_init"}
+        for module in network.modules():
+            if isinstance(module, MemoryModule | MemoryNetwork):
+                self.stores.add(module.store)
+                self.start_keys.add(module.recurrence.is_init_key)
+        self.reads_first_state_only = self.stores == {"sequence"}
+        self.loads_at_starts = loads_at_starts(network)
 
 
 def entry(batch: TensorDictBase, key: Key) -> Tensor:
@@ -57,18 +75,6 @@ def is_prepared(batch: TensorDictBase) -> bool:
     an entry of that.
     """
     return isinstance(batch.get("extended", None), TensorDictBase) and "position" in batch
-
-
-def step_mask(batch: TensorDictBase, shape: torch.Size) -> Tensor | None:
-    """Which steps are no padding, bool of this shape [..., L]; None if the batch does not say."""
-    masks = []
-    for key in MASKS:
-        mask = batch.get(key, None)
-        if isinstance(mask, Tensor) and mask.shape in (shape, (*shape, 1)):
-            masks.append(mask.reshape(shape).bool())
-    if not masks:
-        return None
-    return masks[0] & masks[-1]
 
 
 def with_mask(batch: TensorDictBase, mask: Tensor | None) -> TensorDictBase:
@@ -196,7 +202,7 @@ def check_order(batch: TensorDictBase, cut: Tensor, mask: Tensor | None, has_mem
             )
 
 
-def check_stored_states(batch: TensorDictBase, inputs: "NetworkInputs") -> None:
+def check_stored_states(batch: TensorDictBase, inputs: NetworkInputs) -> None:
     """Refuse a stock batch whose sampler cut episodes (``is_init`` in mid-episode) if states stored
     there get lost (ValueError).
     """

@@ -268,7 +268,8 @@ class DQNConfig(QConfig):
         )
         held = self.replay_sequences
         needed = max(self.batch_sequences, self.learning_starts, self.num_envs)
-        frames = -(-needed // self.num_envs) * self.num_envs * length
+        windows = -(-needed // self.num_envs)
+        frames = windows * self.num_envs * length
         self._require(
             held >= needed,
             "replay_frames",
@@ -278,9 +279,8 @@ class DQNConfig(QConfig):
     @property
     def replay_sequences(self) -> int:
         """Capacity in sequences: whole windows of all environments."""
-        return (
-            self.replay_frames // (self.num_envs * (self.overlap + self.num_steps)) * self.num_envs
-        )
+        window = self.num_envs * (self.overlap + self.num_steps)
+        return self.replay_frames // window * self.num_envs
 
 
 GROUPS: dict[str, type[LearnerConfig]] = {"pqn": PQNConfig, "ppo": PPOConfig, "dqn": DQNConfig}

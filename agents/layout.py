@@ -17,43 +17,16 @@ from torchrl.modules import set_recurrent_mode
 
 from arcade_torch.agents.batch_checks import (
     Key,
-    check_module,
+    NetworkInputs,
     check_order,
-    check_state_keys,
     check_stored_states,
     entry,
     flat,
     is_stock,
-    loads_at_starts,
-    step_mask,
     written,
 )
-from arcade_torch.models.memory_module import MemoryModule
+from arcade_torch.models.memory import step_mask
 from arcade_torch.models.networks import MemoryNetwork
-from arcade_torch.rollout_buffer import final_key
-
-
-class NetworkInputs:
-    """Which entries of a batch a TensorDict module reads; a key that it also writes under "next" is
-    recurrent state.
-    """
-
-    def __init__(self, network: TensorDictModuleBase) -> None:
-        check_module(network)
-        check_state_keys(network)
-        keys = [unravel_key(key) for key in network.in_keys]
-        written = {unravel_key(key) for key in network.out_keys}
-        self.state_keys = [key for key in keys if unravel_key(("next", key)) in written]
-        self.observation_keys = [key for key in keys if key not in self.state_keys]
-        self.final_keys = {key: final_key(key) for key in keys}
-        self.stores = set()
-        self.start_keys: set[Key] = {"is_init"}
-        for module in network.modules():
-            if isinstance(module, MemoryModule | MemoryNetwork):
-                self.stores.add(module.store)
-                self.start_keys.add(module.recurrence.is_init_key)
-        self.reads_first_state_only = self.stores == {"sequence"}
-        self.loads_at_starts = loads_at_starts(network)
 
 
 def insert_final_observations(
@@ -115,12 +88,6 @@ def insert_final_observations(
     _add_observations(out, batch, inputs, final_steps, order, burn_in)
     _add_state(out, batch, inputs)
     return out
-
-
-def _stored_state(batch: TensorDictBase) -> TensorDictBase | None:
-    """The ``initial_state`` of sequences; an observation of that name is none."""
-    state = batch.get("initial_state", None)
-    return state if isinstance(state, TensorDictBase) else None
 
 
 def _rename(batch: TensorDictBase, names: dict[str, Key]) -> TensorDictBase:
@@ -211,8 +178,7 @@ def _final_places(batch: TensorDictBase, needed: Tensor) -> tuple[Tensor, Tensor
     if missing:
         raise ValueError(
             "next observations must be stored where needed: collect with final_frames='truncated' "
-            "or 'all', "
-            f"or take time_limit='terminal'; got {missing} missing"
+            f"or 'all', or take time_limit='terminal'; got {missing} missing"
         )
     return final_steps, used
 
@@ -270,6 +236,37 @@ def _add_observations(
         out["burn_in"] = before
 
 
+def _next(batch: TensorDictBase, key: Key, steps: Tensor, inputs: NetworkInputs) -> Tensor:
+    """An entry [N, K, ...] of the observations behind the steps [N, K]. Its start flags are false,
+    so that states that are stored there are not read.
+    """
+    if key in inputs.start_keys:
+        return torch.zeros_like(steps, dtype=torch.bool).unsqueeze(-1)
+    final = batch.get(inputs.final_keys[key], None)
+    if final is not None:
+        return final  # type: ignore[no-any-return]
+    value = batch.get(unravel_key(("next", key)), None)
+    if value is None and key == "last_action":
+        value = batch.get("action", None)
+    if value is None and key in inputs.state_keys:
+        value = batch.get(key, None)
+    if value is None:
+        raise KeyError(
+            f"no next observations: neither {inputs.final_keys[key]!r} nor ('next', {key!r}): "
+            "collect with compact_obs=False, or with final_frames='all'; or take what "
+            "ArcadeCollector.collect() gives"
+        )
+    return _rows(value, steps)
+
+
+def _rows(value: Tensor, index: Tensor) -> Tensor:
+    """Entries [N, K, ...] of [N, L, ...] at the steps ``index`` [N, K]."""
+    first_of_row = torch.arange(len(index), device=index.device).unsqueeze(1) * value.shape[1]
+    flat_index = (index + first_of_row).flatten()
+    chosen = value.flatten(0, 1).index_select(0, flat_index)
+    return chosen.view(*index.shape, *value.shape[2:])
+
+
 def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs) -> None:
     """Write ``initial_state``, the recurrent state before the first step."""
     if not inputs.state_keys:
@@ -298,27 +295,10 @@ def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs) ->
         )
 
 
-def _next(batch: TensorDictBase, key: Key, steps: Tensor, inputs: NetworkInputs) -> Tensor:
-    """An entry of the observations [N, K] behind some steps; nothing begins there, so no state is
-    read.
-    """
-    if key in inputs.start_keys:
-        return torch.zeros_like(steps, dtype=torch.bool).unsqueeze(-1)
-    final = batch.get(inputs.final_keys[key], None)
-    if final is not None:
-        return final  # type: ignore[no-any-return]
-    value = batch.get(unravel_key(("next", key)), None)
-    if value is None and key == "last_action":
-        value = batch.get("action", None)
-    if value is None and key in inputs.state_keys:
-        value = batch.get(key, None)
-    if value is None:
-        raise KeyError(
-            f"no next observations: neither {inputs.final_keys[key]!r} nor ('next', {key!r}): "
-            "collect with compact_obs=False, or with final_frames='all'; or take what "
-            "ArcadeCollector.collect() gives"
-        )
-    return _rows(value, steps)
+def _stored_state(batch: TensorDictBase) -> TensorDictBase | None:
+    """The ``initial_state`` of sequences; an observation of that name is none."""
+    state = batch.get("initial_state", None)
+    return state if isinstance(state, TensorDictBase) else None
 
 
 def unroll(
@@ -342,14 +322,8 @@ def unroll(
     state = sequences.get("initial_state", None)
     burn_in = sequences.get("burn_in", None)
     if burn_in is not None and inputs.state_keys:
-        # no gradient: it only brings the state up to date (R2D2)
-        with torch.no_grad(), set_recurrent_mode(False):
-            for t in range(burn_in.shape[1]):
-                step = _with_state(burn_in[:, t], state, inputs)
-                if t == 0 and state is not None and inputs.loads_at_starts:
-                    _clear_starts(step, inputs)  # as in a pass over time
-                state = network(step).get("next").select(*inputs.state_keys)
-            state = _loaded_at_start(extended[:, 0], state, inputs)
+        state = _state_after(burn_in, state, network, inputs)
+        state = _loaded_at_start(extended[:, 0], state, inputs)
     if isinstance(network, MemoryNetwork) and network.store == "sequence" and key in network.heads:
         # the same without a TensorDict in between
         return network.read_sequences(extended, state)[key]
@@ -358,6 +332,74 @@ def unroll(
         _begin_with(extended, state, inputs)
     with set_recurrent_mode(True):
         return written(network(extended), key, network)
+
+
+@torch.no_grad()
+def _state_after(
+    burn_in: TensorDictBase,
+    state: TensorDictBase | None,
+    network: TensorDictModuleBase,
+    inputs: NetworkInputs,
+) -> TensorDictBase:
+    """The recurrent state [B] that steps [B, T] lead to from a state [B], one step a call. Without
+    gradient: they only bring the state up to date (R2D2).
+    """
+    with set_recurrent_mode(False):
+        for t in range(burn_in.shape[1]):
+            step = _with_state(burn_in[:, t], state, inputs)
+            if t == 0 and state is not None and inputs.loads_at_starts:
+                _clear_starts(step, inputs)  # as in a pass over time
+            state = network(step).get("next").select(*inputs.state_keys)
+    assert state is not None
+    return state
+
+
+def _with_state(
+    step: TensorDictBase, state: TensorDictBase | None, inputs: NetworkInputs
+) -> TensorDictBase:
+    """A step [B] that goes on from a state [B]; rows that begin an episode go on from the state
+    that is stored with the step. If none is, the network begins anew by itself, as when it acted.
+    """
+    step = step.copy()
+    if state is None:
+        return step
+    if any(key in step for key in inputs.state_keys):
+        state = _loaded_at_start(step, state, inputs)
+        _clear_starts(step, inputs)
+    return step.update(state)
+
+
+def _clear_starts(step: TensorDictBase, inputs: NetworkInputs) -> None:
+    """Let nothing begin at a step: its flags would drop the state that was loaded."""
+    for key in inputs.start_keys:
+        if key in step:
+            step[key] = torch.zeros_like(step[key])
+
+
+def _loaded_at_start(
+    step: TensorDictBase, state: TensorDictBase, inputs: NetworkInputs
+) -> TensorDictBase:
+    """A state [B]; rows in which the step [B] begins an episode have the state that is stored with
+    the step instead, or zeros.
+    """
+    starts = [key for key in inputs.start_keys if key in step]
+    if inputs.reads_first_state_only or not starts:
+        return state
+    stored = state.clone().zero_().update(step.select(*inputs.state_keys, strict=False))
+    return stored.where(step[starts[0]].squeeze(-1), state)
+
+
+def _begin_with(sequences: TensorDictBase, state: TensorDictBase, inputs: NetworkInputs) -> None:
+    """Write states [B] to the first step of sequences [B, T]. At later steps stored states stay;
+    where none are stored they are zero.
+    """
+    for key in inputs.state_keys:
+        first = state.get(key)
+        states = first.unsqueeze(1).expand(-1, sequences.shape[1], *first.shape[1:])  # a view
+        if not inputs.reads_first_state_only:
+            stored = sequences.get(key, torch.zeros_like(states))
+            states = torch.cat((states[:, :1], stored[:, 1:]), dim=1)
+        sequences[key] = states
 
 
 def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> TensorDictBase:
@@ -385,63 +427,9 @@ def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> Tensor
 
 
 def _with_flags(batch: TensorDictBase, inputs: NetworkInputs) -> TensorDictBase:
-    """The batch with start flags [*, L, 1], as memories read them."""
+    """The batch with start flags bool [*, L, 1]."""
     for key in inputs.start_keys:
         flags = batch.get(key, None)
         if flags is not None and (flags.shape == batch.shape or flags.dtype != torch.bool):
             batch = batch.copy().set(key, flags.bool().reshape(*batch.shape, 1))
     return batch
-
-
-def _with_state(
-    step: TensorDictBase, state: TensorDictBase | None, inputs: NetworkInputs
-) -> TensorDictBase:
-    """A step [B] that goes on from a state [B]. At a start it has the state that is stored there;
-    where none is, the network begins anew by itself, as when it acted.
-    """
-    step = step.copy()
-    if state is None:
-        return step
-    if any(key in step for key in inputs.state_keys):
-        state = _loaded_at_start(step, state, inputs)
-        _clear_starts(step, inputs)
-    return step.update(state)
-
-
-def _clear_starts(step: TensorDictBase, inputs: NetworkInputs) -> None:
-    """Let nothing begin at a step: its flags would drop the state that was loaded."""
-    for key in inputs.start_keys:
-        if key in step:
-            step[key] = torch.zeros_like(step[key])
-
-
-def _loaded_at_start(
-    step: TensorDictBase, state: TensorDictBase, inputs: NetworkInputs
-) -> TensorDictBase:
-    """A state [B], but where a step [B] begins something that which is stored there, else zeros."""
-    starts = [key for key in inputs.start_keys if key in step]
-    if inputs.reads_first_state_only or not starts:
-        return state
-    stored = state.clone().zero_().update(step.select(*inputs.state_keys, strict=False))
-    return stored.where(step[starts[0]].squeeze(-1), state)
-
-
-def _begin_with(sequences: TensorDictBase, state: TensorDictBase, inputs: NetworkInputs) -> None:
-    """Let sequences [B, T] begin with states [B]; states that are stored later on stay, others are
-    zero.
-    """
-    for key in inputs.state_keys:
-        first = state.get(key)
-        states = first.unsqueeze(1).expand(-1, sequences.shape[1], *first.shape[1:])  # a view
-        if not inputs.reads_first_state_only:
-            stored = sequences.get(key, torch.zeros_like(states))
-            states = torch.cat((states[:, :1], stored[:, 1:]), dim=1)
-        sequences[key] = states
-
-
-def _rows(value: Tensor, index: Tensor) -> Tensor:
-    """Entries [N, K, ...] of [N, L, ...] at the steps ``index`` [N, K]."""
-    first_of_row = torch.arange(len(index), device=index.device).unsqueeze(1) * value.shape[1]
-    flat_index = (index + first_of_row).flatten()
-    chosen = value.flatten(0, 1).index_select(0, flat_index)
-    return chosen.view(*index.shape, *value.shape[2:])

@@ -20,21 +20,22 @@ from torchrl.objectives.utils import dispatch_value_estimator
 
 from arcade_torch.agents.batch_checks import (
     Key,
+    NetworkInputs,
     entry,
     one_a_step,
-    step_mask,
     stored_numbers,
     with_mask,
     written,
 )
 from arcade_torch.agents.checked import Finite, Positive, coerce, require
 from arcade_torch.agents.config import PPOConfig, TimeLimit
-from arcade_torch.agents.layout import NetworkInputs, as_steps
+from arcade_torch.agents.layout import as_steps
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.network_loss import NetworkLoss, Reduction, check_actor
 from arcade_torch.agents.policy import make_actor
 from arcade_torch.agents.returns import SequenceGAE, normalize
 from arcade_torch.envs_jax.validation import plain
+from arcade_torch.models.memory import step_mask
 
 
 def ppo_objective(
@@ -226,13 +227,15 @@ class PPOLoss(NetworkLoss):
         self._default_value_estimator()
 
     def _set_in_keys(self) -> None:
-        """Entries that every batch holds; when names are set, assign others for plain tensors."""
+        """Set ``in_keys`` to the entries that every batch holds; plain tensors are taken in this
+        order. Who wants another order assigns it after the names are set.
+        """
         keys = self.tensor_keys
-        roots = [*self.inputs.observation_keys, *self.inputs.state_keys]
-        more = [keys.action, keys.sample_log_prob]
+        inputs = [*self.inputs.observation_keys, *self.inputs.state_keys]
+        acted = [keys.action, keys.sample_log_prob]
         outcome = [("next", name) for name in (keys.reward, keys.done, keys.terminated)]
-        nexts = [("next", key) for key in self.inputs.observation_keys if key != keys.is_init]
-        self.in_keys = list(dict.fromkeys([*roots, *more, *outcome, *nexts]))
+        following = [("next", key) for key in self.inputs.observation_keys if key != keys.is_init]
+        self.in_keys = list(dict.fromkeys([*inputs, *acted, *outcome, *following]))
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> None:
         """Choose how advantages are made.
@@ -259,8 +262,8 @@ class PPOLoss(NetworkLoss):
 
     def _forward_value_estimator_keys(self, **kwargs: Any) -> None:
         """Let the estimator know the names of the entries."""
-        names = ["advantage", "value_target", "value", "reward", "done", "terminated"]
-        names.append("sample_log_prob")
+        names = ["advantage", "value_target", "value", "sample_log_prob"]
+        names += ["reward", "done", "terminated"]
         if isinstance(self._value_estimator, SequenceGAE):
             names += ["action", "truncated", "is_init"]
         if self._value_estimator is not None:
@@ -430,11 +433,12 @@ class PPO(Learner):
             self.gradient_step(minibatch, frames)
             frames += self.frames_per_step
         metrics = self.take_metrics()
+        value_loss = None
+        if self.config.critic_coeff:
+            value_loss = metrics["loss_critic"] / self.config.critic_coeff
         return metrics | {
             "policy_loss": metrics["loss_objective"],
-            "value_loss": metrics["loss_critic"] / self.config.critic_coeff
-            if self.config.critic_coeff
-            else None,
+            "value_loss": value_loss,
             "kl": metrics["kl_approx"],
             "q_mean": float(data["state_value"].mean()),
             "td_error": float(data["advantage"].abs().mean()),

@@ -16,10 +16,10 @@ from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 from torchrl.objectives.value import ValueEstimatorBase
 
-from arcade_torch.agents.batch_checks import Key, is_prepared, is_stock, with_mask
+from arcade_torch.agents.batch_checks import Key, NetworkInputs, is_prepared, is_stock, with_mask
 from arcade_torch.agents.checked import CountOrZero, coerce, require
 from arcade_torch.agents.config import Bootstrap, PQNConfig, TimeLimit
-from arcade_torch.agents.layout import NetworkInputs, insert_final_observations, unroll
+from arcade_torch.agents.layout import insert_final_observations, unroll
 from arcade_torch.agents.learner import Learner, Training
 from arcade_torch.agents.network_loss import NetworkLoss, Reduction
 from arcade_torch.agents.returns import QLambdaEstimator
@@ -122,16 +122,16 @@ class PQNLoss(NetworkLoss):
         self._default_value_estimator()
 
     def _set_in_keys(self) -> None:
-        """Entries that every batch holds; when names are set, assign others for plain tensors in
-        another order.
+        """Set ``in_keys`` to the entries that every batch holds; plain tensors are taken in this
+        order. Who wants another order assigns it after the names are set.
         """
         keys = self.tensor_keys
         roots = dict.fromkeys(
             [*self.inputs.observation_keys, *self.inputs.state_keys, keys.action, keys.is_init]
         )
         outcome = [("next", key) for key in (keys.reward, keys.terminated, keys.truncated)]
-        nexts = [("next", key) for key in self.inputs.observation_keys if key != keys.is_init]
-        self.in_keys = [*roots, *outcome, *nexts]
+        following = [("next", key) for key in self.inputs.observation_keys if key != keys.is_init]
+        self.in_keys = [*roots, *outcome, *following]
 
     def make_value_estimator(
         self, value_type: ValueEstimators | ValueEstimatorBase | None = None, **hyperparams: Any

@@ -6,8 +6,9 @@ from tensordict.nn import ProbabilisticTensorDictModule, TensorDictModuleBase
 from torch import Tensor
 from torchrl.modules import set_recurrent_mode
 
-from arcade_torch.agents.batch_checks import MASKS, Key, step_mask
-from arcade_torch.agents.layout import NetworkInputs, as_steps
+from arcade_torch.agents.batch_checks import Key, NetworkInputs
+from arcade_torch.agents.layout import as_steps
+from arcade_torch.models.memory import MASKS, step_mask
 
 __all__ = ["check_replay"]
 

@@ -12,10 +12,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.objectives.value import TDLambdaEstimator
 
-from arcade_torch.agents.batch_checks import is_stock
+from arcade_torch.agents.batch_checks import NetworkInputs, is_stock
 from arcade_torch.agents.checked import Count, Fraction, coerce, require
 from arcade_torch.agents.config import TimeLimit
-from arcade_torch.agents.layout import NetworkInputs, insert_final_observations, unroll
+from arcade_torch.agents.layout import insert_final_observations, unroll
 from arcade_torch.envs_jax.validation import format_value, plain
 
 

@@ -2,10 +2,11 @@
 
 import functools
 from collections import OrderedDict, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import nullcontext
 from typing import Any
 
+import numpy as np
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from torch import nn
@@ -27,6 +28,7 @@ from arcade_torch.policies import (
     random_actions,
 )
 from arcade_torch.process import warn
+from arcade_torch.raw_step import RawStep
 from arcade_torch.rollout_buffer import Entry, FinalFrames, RolloutBuffer
 from arcade_torch.suite_actions import as_got
 from arcade_torch.validation import check_flags, whole
@@ -165,15 +167,6 @@ class ArcadeCollector(BaseCollector):
         self._window_starts: deque[TensorDict] = deque()
         self._begin_trajectories()
 
-    def _begin_trajectories(self) -> None:
-        """Give the episodes of all envs new numbers."""
-        first = self._next_traj_id
-        self._next_traj_id = first + self._num_envs
-        self._traj_ids = torch.arange(
-            first, self._next_traj_id, dtype=torch.int64, device=self.env.device
-        )
-        self._numbered = self._iter  # the last window whose episodes were numbered
-
     @property
     def frames(self) -> int:
         """Env steps collected so far, without those that filled the first overlap."""
@@ -251,11 +244,7 @@ class ArcadeCollector(BaseCollector):
                 obs = self._advance(buffer, obs, step, random)
         last = {key: obs[key] for key in self.env.observation_keys}
         wanted = buffer.finish(began_with, last)
-        for rows, steps, drawn, counting in self._finals.draw(wanted):
-            final = {}
-            for key, array in drawn.items():
-                final[key] = to_torch(array, self.env.device)[counting]
-            buffer.write_final(rows, steps, self._compressed(final))
+        self._write_finals(buffer, wanted)
         buffer.keep_overlap()
         initial_state = self._window_starts.popleft()
         self._frames += self._num_envs * self._steps
@@ -265,9 +254,17 @@ class ArcadeCollector(BaseCollector):
         self._seen = self.env.generation
         return buffer, initial_state
 
+    def _write_finals(self, buffer: RolloutBuffer, wanted: np.ndarray) -> None:
+        """Draw the final observations of steps, bool [N, L], and store them."""
+        for rows, steps, drawn, counting in self._finals.draw(wanted):
+            final: dict[NestedKey, torch.Tensor] = {}
+            for key, array in drawn.items():
+                final[key] = to_torch(array, self.env.device)[counting]
+            buffer.write_final(rows, steps, self._compressed(final))
+
     def _look(self) -> tuple[RolloutBuffer, dict[NestedKey, torch.Tensor]]:
-        """Have a current observation and a place to store it, whatever happened to the env since
-        the last window.
+        """Give the storage of the next window and the observation that it begins with, whatever
+        happened to the env since the last one.
         """
         if self._obs is None:
             self._observe(self.env.reset())
@@ -293,10 +290,13 @@ class ArcadeCollector(BaseCollector):
         observation = {}
         for key in env.observation_keys:
             observation[key] = Entry(tuple(obs[key].shape[1:]), obs[key].dtype)
-        of_games = isinstance(env, ArcadeEnv)
-        limits = (
-            [game.max_steps for game in env.games] if of_games else [env.least_steps_to_truncation]
-        )
+        task = None
+        if isinstance(env, ArcadeEnv):
+            max_steps = min(game.max_steps for game in env.games)
+            if env.task_in_td:
+                task = env.task
+        else:
+            max_steps = env.least_steps_to_truncation
         return RolloutBuffer(
             self._num_envs,
             self._overlap,
@@ -305,8 +305,8 @@ class ArcadeCollector(BaseCollector):
             action=Entry(tuple(env.action_spec.shape[1:]), env.action_spec.dtype),
             device=env.device,
             final_frames=self._final_frames,
-            max_steps=min(limits),
-            task=env.task if of_games and env.task_in_td else None,
+            max_steps=max_steps,
+            task=task,
         )
 
     def _observe(self, root: TensorDictBase) -> None:
@@ -342,7 +342,16 @@ class ArcadeCollector(BaseCollector):
         if self._final_frames != "none" and self._may_have_ended(raw.numbers):
             self._finals.add(step, raw.final)
         self._acted += 1
+        # behind the last step all of it, for the next window begins there
         reads = ROOT_KEYS if step == buffer.length - 1 else self._runner.reads
+        return self._following(raw, action, reads)
+
+    def _following(
+        self, raw: RawStep, action: torch.Tensor, reads: Collection[NestedKey]
+    ) -> dict[NestedKey, torch.Tensor]:
+        """What is acted on after a step: the observation, and of the other root keys those that are
+        read.
+        """
         following = dict(self._compressed(raw.observation))
         following.update(raw.root_numbers(reads))
         if "last_action" in reads:
@@ -353,11 +362,20 @@ class ArcadeCollector(BaseCollector):
         return following
 
     def _may_have_ended(self, numbers: torch.Tensor) -> bool:
-        """Whether a final observation may be wanted; a look is free on the CPU, where kept states
-        scatter memory.
+        """Whether a final observation may be wanted. On a GPU nobody waits to see; on the CPU a
+        look is free, and states that are kept scatter memory.
         """
         first = TERMINATED if self._final_frames == "all" else TRUNCATED
         return not is_host(numbers.device) or bool(numbers.numpy()[:, first:].any())
+
+    def _begin_trajectories(self) -> None:
+        """Give the episodes of all envs new numbers."""
+        first = self._next_traj_id
+        self._next_traj_id = first + self._num_envs
+        self._traj_ids = torch.arange(
+            first, self._next_traj_id, dtype=torch.int64, device=self.env.device
+        )
+        self._numbered = self._iter  # the last window whose episodes were numbered
 
     def _trajectories(self, buffer: RolloutBuffer) -> torch.Tensor:
         """Episode numbers int64 [N, T] of the new steps, as TorchRL's collectors count them.
@@ -461,17 +479,23 @@ class ArcadeCollector(BaseCollector):
         self.reset()
         self._frames = int(state_dict["frames"])
         self._iter = int(state_dict["iter"])
-        given = self._gave_numbers and self._next_traj_id > int(state_dict.get("next_traj_id", 0))
-        # an older state: its numbers stand in batches that came after it
-        if "traj_ids" in state_dict and not given:
-            self._traj_ids = state_dict["traj_ids"].to(self.env.device)
-            self._next_traj_id = int(state_dict["next_traj_id"])
-        self._numbered = int(state_dict.get("numbered", self._iter))
+        self._load_trajectories(state_dict)
         if "recurrent_state" not in state_dict:
             # of a window that was lost: _look begins anew where the env is
             self._obs = {} if state_dict.get("begun", False) else None
             return
         self._load_windows(state_dict)
+
+    def _load_trajectories(self, state_dict: dict[str, Any]) -> None:
+        """Load the numbers of the episodes, unless batches that somebody may hold have them: this
+        collector went on behind an older state, or the state is of a version that saved none.
+        """
+        saved_next = int(state_dict.get("next_traj_id", 0))
+        are_taken = self._gave_numbers and self._next_traj_id > saved_next
+        if "traj_ids" in state_dict and not are_taken:
+            self._traj_ids = state_dict["traj_ids"].to(self.env.device)
+            self._next_traj_id = saved_next
+        self._numbered = int(state_dict.get("numbered", self._iter))
 
     def _load_windows(self, state_dict: dict[str, Any]) -> None:
         """Load what the coming windows go on with: observation, overlap, recurrent states."""

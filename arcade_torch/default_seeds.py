@@ -47,7 +47,6 @@ def warn_of_twins(env: Any) -> None:
     _warned = True
     says = (
         f"this env has the default seed, 0, and plays the very same episodes as {others}: give "
-        "each its own "
-        "(arcade_torch.make(..., seed=i)), or call set_seed on the env that holds them"
+        "each its own (arcade_torch.make(..., seed=i)), or call set_seed on the env that holds them"
     )
     warn(says)

@@ -152,6 +152,5 @@ def warn_frames_are_copied() -> None:
     )
     warn(
         f"torch is on CUDA but JAX computes on the CPU ({package} {have}): every frame is copied "
-        "to the GPU. "
-        f"Install it with: pip install 'jax[cuda{major}]'"
+        f"to the GPU. Install it with: pip install 'jax[cuda{major}]'"
     )

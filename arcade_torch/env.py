@@ -3,13 +3,13 @@ JAX wrote.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import jax
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Composite
 
 from arcade_torch import default_seeds, validation
 from arcade_torch.base_env import BaseEnv
@@ -42,9 +42,8 @@ from arcade_torch.snapshot import Snapshots
 from arcade_torch.specs import make_specs
 
 
-@dataclass
-class Live:
-    """Where the episodes are. Beside the env, for ``nn.Module`` sets attributes slowly."""
+class Live(NamedTuple):
+    """Where the episodes are."""
 
     batch: Batch  # without flags of an end
     ended: Ended
@@ -133,34 +132,15 @@ class ArcadeEnv(BaseEnv):
         self._state_in_td = state_in_td
         self._task = torch.from_numpy(self._batched.task(num_envs)).to(torch_device)
         self.task_in_td = len(self.games) > 1 if task_in_td is None else task_in_td
-        wait_for_torch(torch_device, jax_device)
-        keys = self._keys(0)
-        partial = jax.device_put(flags, jax_device)
-        with jax.default_device(jax_device):
-            blank = jax.device_put(self._batched.blank(keys, partial), jax_device)
-        # what every reset runs: to begin by ``init`` would compile the game's reset once more
-        first, _ = self._batched.reset_render(blank, np.ones(num_envs, np.bool_))
         self._no_ends = torch.zeros(num_envs, 2, dtype=torch.bool, device=torch_device)
         no = jax.device_put(np.zeros(num_envs, np.bool_), jax_device)
         self._none_ended: Ended = (no, no)
-        self._live = Live(first, self._none_ended, self._no_ends)
+        self._live = Live(self._first_batch(flags), self._none_ended, self._no_ends)
         shape = (num_envs, self.game.obs_size, self.game.obs_size, 3)
         self._memory = FrameMemory(shape, jax_device)
-        self._ends = FrameMemory(shape, jax_device)
+        self._final_memory = FrameMemory(shape, jax_device)
         self._snapshots = Snapshots(self._batched, self._with_ends(), torch_device, jax_device)
-        tasks = len(self.games) if self.task_in_td else 0
-        action, observation, reward, done = make_specs(
-            num_envs, self.game.obs_size, self.game.num_actions, tasks, self.one_hot, torch_device
-        )
-        self.action_spec = action
-        self.reward_spec = reward
-        self.done_spec = done
-        if state_in_td:
-            observation["state"] = self._snapshots.spec()
-            self.state_spec = type(observation)(
-                state=self._snapshots.spec(), shape=(num_envs,), device=torch_device
-            )
-        self.observation_spec = observation
+        self._set_specs()
         self._begun = False
         self._set_seed(seed)
 
@@ -232,10 +212,9 @@ class ArcadeEnv(BaseEnv):
         """
         flags = changed_flags(observability, self.num_envs)
         wait_for_torch(self.device, self._jax_device)
-        self._live.batch = self._live.batch._replace(
-            partial=jax.device_put(flags, self._jax_device)
-        )
-        self._live.view += 1
+        partial = jax.device_put(flags, self._jax_device)
+        live = self._live
+        self._live = live._replace(batch=live.batch._replace(partial=partial), view=live.view + 1)
 
     def get_state(self) -> TensorDict:
         """Copy everything that determines the future: game states, random keys, observability,
@@ -294,8 +273,8 @@ class ArcadeEnv(BaseEnv):
 
     @property
     def generation(self) -> tuple[int, int]:
-        """Changes of the state (steps, resets, loads) and of the observability, so that a collector
-        notices others'.
+        """How often the state (by steps, resets, loads) and the observability have changed, so that
+        a collector notices changes that it has not made.
         """
         return self._live.generation, self._live.view
 
@@ -355,82 +334,67 @@ class ArcadeEnv(BaseEnv):
         return ("pixels",)
 
     def draws_safely(self) -> bool:
-        """Whether steps may draw into memory that tensors lie over: a step that fails would take it
-        along.
+        """Whether steps may draw into memory that tensors lie over. Not where a step calls code of
+        the game that may fail: the memory would be lost with the step.
         """
         return not self._compiled.calls_back(self._live.batch)
 
     def final_observations(self, max_steps: int) -> FinalObservations:
-        """Something that keeps the states of up to ``max_steps`` steps, and draws the ends among
-        them when asked.
-        """
+        """A store for the states of up to ``max_steps`` steps; draws the final ones when asked."""
         return FinalObservations(self._compiled, self.num_envs, max_steps, self._jax_device)
 
-    def _go_on(
-        self, batch: Batch, ended: Ended | None = None, ends: torch.Tensor | None = None
-    ) -> None:
-        """Put another state in place, all at once: an interrupt leaves the old state or the new
-        one.
+    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> Any:
+        """Seed the batch, see TorchRL's `EnvBase`; ``seed`` may be of numpy or torch too."""
+        return super().set_seed(plain(seed), static_seed)
 
-        Args:
-            batch: Without flags of an end.
-            ended: Where it has ended; None: nowhere.
-            ends: bool [N, 2], what a root says of that: where its last step terminated or
-                truncated; None: nowhere.
-        """
-        ended = self._none_ended if ended is None else ended
-        ends = self._no_ends if ends is None else ends
-        vars(self._live).update(
-            batch=batch, ended=ended, ends=ends, generation=self._live.generation + 1
-        )
-
-    def _go_on_from(
-        self,
-        state: TensorDictBase | None,
-        ends: torch.Tensor | None = None,
-        partial: jax.Array | None = None,
-    ) -> None:
-        """Put a snapshot in place; ``partial`` (bool [N]) says which twins to show in its place."""
-        batch = self._snapshots.load(state)
-        if partial is not None:
-            batch = batch._replace(partial=partial)
-        terminated, truncated = self._batched.ends(batch)
-        some_ended = np.asarray(terminated).any() or np.asarray(truncated).any()
-        ended = (terminated, truncated) if some_ended else None
-        self._go_on(self._batched.without_ends(batch), ended, ends)
-
-    def _still_ended(self, rows: np.ndarray) -> Ended:
-        """Where, of the envs ``rows`` (bool [N]), the live batch has ended."""
-        terminated = self._live.ended[0] & rows
-        truncated = self._live.ended[1] & rows
-        # Fused steps are faster where none has; but a look at memory of a GPU would wait for it.
-        if is_host(self.device) and not (np.asarray(terminated) | np.asarray(truncated)).any():
-            return self._none_ended
-        return terminated, truncated
-
-    def _with_ends(self) -> Batch:
-        """The live batch with the flags of an end."""
-        return self._flagged(self._live.batch, self._live.ended)
-
-    def _flagged(self, batch: Batch, ended: Ended) -> Batch:
-        """A batch with the flags of an end; those that a mixture adds are made where the env is."""
+    def _first_batch(self, partial: np.ndarray) -> Batch:
+        """Episodes that begin, of the twins ``partial`` (bool [N])."""
+        wait_for_torch(self.device, self._jax_device)
+        keys = self._keys(0)
+        flags = jax.device_put(partial, self._jax_device)
         with jax.default_device(self._jax_device):
-            return self._batched.with_ends(batch, *ended)
+            blank = jax.device_put(self._batched.blank(keys, flags), self._jax_device)
+        # what every reset runs: to begin by ``init`` would compile the game's reset once more
+        first: Batch = self._batched.reset_render(blank, np.ones(self.num_envs, np.bool_))[0]
+        return first
 
-    def _integers(self, action: torch.Tensor) -> torch.Tensor:
-        """The actions as integers [N]; raises if they are not what the spec says, or in a process
-        that cannot step.
+    def _set_specs(self) -> None:
+        """Tell TorchRL what the entries are."""
+        game = self.game
+        tasks = len(self.games) if self.task_in_td else 0
+        action, observation, reward, done = make_specs(
+            self.num_envs, game.obs_size, game.num_actions, tasks, self.one_hot, self.device
+        )
+        self.action_spec = action
+        self.reward_spec = reward
+        self.done_spec = done
+        if self._state_in_td:
+            state = self._snapshots.spec()
+            observation["state"] = state
+            self.state_spec = Composite(
+                state=state.clone(), shape=(self.num_envs,), device=self.device
+            )
+        self.observation_spec = observation
+
+    def _set_seed(self, seed: int | None) -> None:
+        """Give every env a new random key and forget the last action; running episodes go on until
+        they are reset.
         """
-        check_process()
-        num_actions = self.game.num_actions
-        if self.one_hot:
-            validation.check_one_hot(action, (self.num_envs, num_actions), self._check_actions)
-            return action.to(torch.float32).argmax(-1)
-        validation.check_integers(action, self.num_envs, num_actions, self._check_actions)
-        return action
+        if seed is None:
+            seed = int(torch.randint(2**32, (), device="cpu"))
+        default_seeds.forget(self)
+        wait_for_torch(self.device, self._jax_device)
+        key = self._keys(seed)
+        last_action = jax.device_put(np.zeros(self.num_envs, np.int32), self._jax_device)
+        seeded = self._live.batch._replace(key=key, last_action=last_action)
+        self._go_on(seeded, self._live.ended, self._live.ends)
 
-    def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
-        validation.check_tensordict(tensordict, self.num_envs)
+    def _keys(self, seed: int) -> jax.Array:
+        """The random keys of a seed, uint32 [N, 2]; computed where the env is, too."""
+        with jax.default_device(self._jax_device):
+            computed = env_keys(seed, self.num_envs)
+        keys: jax.Array = jax.device_put(computed, self._jax_device)
+        return keys
 
     def _reset(
         self, tensordict: TensorDictBase | None = None, set_state: bool = False, **kwargs: Any
@@ -461,7 +425,7 @@ class ArcadeEnv(BaseEnv):
             self._go_on_from(tensordict.get("state", None), partial=self._live.batch.partial)
         action = self._integers(validation.tensor(tensordict, "action"))
         argument = int32_argument(action, self._jax_device)
-        before = Live(self._live.batch, self._live.ended, self._live.ends)
+        before = self._live
         batch, ended, pixels, packed = self._compiled.step_only(
             before.batch, before.ended, argument, self._memory.spare()
         )
@@ -478,13 +442,13 @@ class ArcadeEnv(BaseEnv):
         return following
 
     def _only_marked(
-        self, tensordict: TensorDictBase, before: "Live", following: TensorDict
+        self, tensordict: TensorDictBase, before: Live, following: TensorDict
     ) -> TensorDictBase:
         """Take the step back in envs that ``_step`` leaves out: ``"next"`` repeats their root, the
         reward is 0.
         """
         marked = validation.mask(tensordict, "_step", self.num_envs)
-        stepped = Live(self._live.batch, self._live.ended, self._live.ends)
+        stepped = self._live
         # where it stays if the next line refuses
         self._go_on(before.batch, before.ended, before.ends)
         validation.check_merge(tensordict, following)
@@ -510,43 +474,89 @@ class ArcadeEnv(BaseEnv):
         following = self._next(raw.pixels, last_action, raw.numbers)
         # all envs are drawn again, which is no dearer than to copy their frames
         if following["done"].any():
-            ended = self._live.batch._replace(state=raw.final[0])
-            drawn = self._ends.show(self._compiled.draw(ended, self._ends.spare()))
-            following._set_str("pixels", to_torch(drawn, self.device), **_UNCHECKED)
+            at_ends = self._live.batch._replace(state=raw.final[0])
+            drawn = self._compiled.draw(at_ends, self._final_memory.spare())
+            final_frames = to_torch(self._final_memory.show(drawn), self.device)
+            following._set_str("pixels", final_frames, **_UNCHECKED)
         validation.keep_what_was_written(tensordict, following)
         tensordict.set("next", following)
         root: TensorDictBase = self._step_mdp(tensordict)
         counts = raw.root_numbers(("is_init", "step_count", "episode_reward"))
-        ends = torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
+        ends = self._no_ends.clone()  # it is handed out
         for key, value in self._entries(raw.pixels, last_action, counts, ends).items():
             root._set_str(key, value, **_UNCHECKED)
         return tensordict, root
 
-    def _keys(self, seed: int) -> jax.Array:
-        """The random keys of a seed, uint32 [N, 2]; computed where the env is, too."""
+    def _assert_tensordict_shape(self, tensordict: TensorDictBase) -> None:
+        validation.check_tensordict(tensordict, self.num_envs)
+
+    def _integers(self, action: torch.Tensor) -> torch.Tensor:
+        """The actions as integers [N]; raises if they are not what the spec says, or in a process
+        that cannot step.
+        """
+        check_process()
+        num_actions = self.game.num_actions
+        if self.one_hot:
+            validation.check_one_hot(action, (self.num_envs, num_actions), self._check_actions)
+            return action.to(torch.float32).argmax(-1)
+        validation.check_integers(action, self.num_envs, num_actions, self._check_actions)
+        return action
+
+    def _go_on(
+        self, batch: Batch, ended: Ended | None = None, ends: torch.Tensor | None = None
+    ) -> None:
+        """Put another state in place, all at once: an interrupt leaves the old state or the new
+        one.
+
+        Args:
+            batch: Without flags of an end.
+            ended: Where it has ended; None: nowhere.
+            ends: bool [N, 2], what a root says of that: where its last step terminated or
+                truncated; None: nowhere.
+        """
+        ended = self._none_ended if ended is None else ended
+        ends = self._no_ends if ends is None else ends
+        live = Live(batch, ended, ends, self._live.generation + 1, self._live.view)
+        self.__dict__["_live"] = live  # ``nn.Module`` sets attributes slowly
+
+    def _go_on_from(
+        self,
+        state: TensorDictBase | None,
+        ends: torch.Tensor | None = None,
+        partial: jax.Array | None = None,
+    ) -> None:
+        """Put a snapshot in place.
+
+        Args:
+            state: The snapshot.
+            ends: See ``_go_on``.
+            partial: bool [N], the twins to show; None: those of the snapshot.
+        """
+        batch = self._snapshots.load(state)
+        if partial is not None:
+            batch = batch._replace(partial=partial)
+        terminated, truncated = self._batched.ends(batch)
+        some_ended = np.asarray(terminated).any() or np.asarray(truncated).any()
+        ended = (terminated, truncated) if some_ended else None
+        self._go_on(self._batched.without_ends(batch), ended, ends)
+
+    def _still_ended(self, rows: np.ndarray) -> Ended:
+        """Where, of the envs ``rows`` (bool [N]), the live batch has ended."""
+        terminated = self._live.ended[0] & rows
+        truncated = self._live.ended[1] & rows
+        # Fused steps are faster where none has; but a look at memory of a GPU would wait for it.
+        if is_host(self.device) and not (np.asarray(terminated) | np.asarray(truncated)).any():
+            return self._none_ended
+        return terminated, truncated
+
+    def _with_ends(self) -> Batch:
+        """The live batch with the flags of an end."""
+        return self._flagged(self._live.batch, self._live.ended)
+
+    def _flagged(self, batch: Batch, ended: Ended) -> Batch:
+        """A batch with the flags of an end; those that a mixture adds are made where the env is."""
         with jax.default_device(self._jax_device):
-            computed = env_keys(seed, self.num_envs)
-        keys: jax.Array = jax.device_put(computed, self._jax_device)
-        return keys
-
-    def set_seed(self, seed: int | None = None, static_seed: bool = False) -> Any:
-        """Seed the batch, see TorchRL's `EnvBase`; a number of numpy or torch will do, of which
-        TorchRL alone makes no next seed.
-        """
-        return super().set_seed(plain(seed), static_seed)
-
-    def _set_seed(self, seed: int | None) -> None:
-        """Give every env a new random key and forget the last action; running episodes go on until
-        they are reset.
-        """
-        if seed is None:
-            seed = int(torch.randint(2**32, (), device="cpu"))
-        default_seeds.forget(self)
-        wait_for_torch(self.device, self._jax_device)
-        key = self._keys(seed)
-        last_action = jax.device_put(np.zeros(self.num_envs, np.int32), self._jax_device)
-        seeded = self._live.batch._replace(key=key, last_action=last_action)
-        self._go_on(seeded, self._live.ended, self._live.ends)
+            return self._batched.with_ends(batch, *ended)
 
     def _root(self, batch: Batch, ended: Ended, frames: torch.Tensor) -> TensorDict:
         """Root tensordict of a live batch and of where it has ended.
@@ -570,7 +580,7 @@ class ArcadeEnv(BaseEnv):
         self, frames: torch.Tensor, action: torch.Tensor, numbers: torch.Tensor
     ) -> TensorDict:
         """The ``"next"`` tensordict. Frames are zero copy, since JAX never reads them again.
-        Rewards are copies, for ``consolidate`` of a tensordict takes no columns.
+        Rewards are copies: ``consolidate`` of a tensordict does not work with columns.
         """
         is_init = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
         step_count = numbers[:, STEP_COUNT, None].to(torch.int64)

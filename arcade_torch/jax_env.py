@@ -1,7 +1,7 @@
 """``from_jax``: any JAX environment with gymnax's two functions, as a batch of TorchRL envs."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,6 @@ from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 
 from arcade_torch import suite_actions, validation
 from arcade_torch.base_env import BaseEnv
-from arcade_torch.compiled import pack_numbers
 from arcade_torch.devices import pick_devices, wait_for_torch
 from arcade_torch.dlpack import is_host, to_jax, to_torch
 from arcade_torch.envs_jax.batch import choose_rows, env_keys
@@ -22,25 +21,10 @@ from arcade_torch.process import check_process
 from arcade_torch.raw_step import Place, RawStep
 from arcade_torch.snapshot import TreeSnapshots
 from arcade_torch.suite import Outcome, Suite, name_of
+from arcade_torch.suite_episodes import BatchedSuite, Episodes
+from arcade_torch.suite_observations import leaf_names
 
 __all__ = ["JaxEnv", "from_jax"]
-
-_OWN_KEYS = (
-    "action", "last_action", "is_init", "step_count", "episode_reward",
-    "reward", "done", "terminated", "truncated", "next", "_reset", "_step",
-)  # fmt: skip
-
-
-class Episodes(NamedTuple):
-    """Everything that is known about N running episodes."""
-
-    key: Any  # uint32 [N, 2], advanced by every step of its env
-    reset_key: Any  # uint32 [N, 2], of the next episode
-    state: Any  # the env's own, leaves [N, ...]
-    obs: Any  # leaves [N, ...]
-    last_action: jax.Array  # [N, ...], zeros before the first step; survives resets
-    step_count: jax.Array  # int32 [N]
-    episode_reward: jax.Array  # float32 [N]
 
 
 class JaxEnv(BaseEnv):
@@ -86,18 +70,12 @@ class JaxEnv(BaseEnv):
         one_action = suite_actions.action_of_one(self.action_spec)
         self._action_dtype = one_action.dtype
         suite.check(one_action)
-        self._compiled_begin = jax.jit(self._begin)
-        self._compiled_begin_anew = jax.jit(self._begin_anew)
-        self._compiled_advance = jax.jit(self._advance)
-        self._compiled_advance_and_begin_anew = jax.jit(self._advance_and_begin_anew)
-        self._compiled_advance_and_pack = jax.jit(self._advance_and_pack)
+        self._batched = BatchedSuite(suite, one_action)
         self._live: Episodes
         self._ends: torch.Tensor | None
         self._count = 0
         self._set_seed(seed)
-        self._obs_key = obs_key
-        names = _leaf_names(self._live.obs, obs_key)
-        self._obs_names = names
+        self._obs_names = leaf_names(self._live.obs, obs_key)
         self.observation_spec = self._observation_spec()
         self.reward_spec = Unbounded((num_envs, 1), dtype=torch.float32, device=torch_device)
         self.done_spec = Composite(
@@ -174,8 +152,8 @@ class JaxEnv(BaseEnv):
 
     @property
     def generation(self) -> tuple[int, int]:
-        """Changes of the state (steps, resets, loads), so that a collector notices others'; and 0,
-        for there is no other view.
+        """How often the state has changed (by steps, resets, loads), so that a collector notices
+        changes that it has not made; and 0, for there is no other view.
         """
         return self._count, 0
 
@@ -211,7 +189,7 @@ class JaxEnv(BaseEnv):
         Raises:
             ValueError: Actions of a wrong shape or out of range.
         """
-        live, final, numbers = self._compiled_advance_and_pack(self._live, self._argument(action))
+        live, final, numbers = self._batched.advance_and_pack(self._live, self._argument(action))
         if while_computing is not None:
             while_computing()
         self._go_on(live)
@@ -222,42 +200,8 @@ class JaxEnv(BaseEnv):
         return False
 
     def final_observations(self, max_steps: int) -> KeptObservations:
-        """Something that keeps the observations that steps led to, before the resets."""
+        """A store for the observations that steps led to, before the resets."""
         return KeptObservations(self._obs_names)
-
-    def _go_on(self, live: Episodes, ends: torch.Tensor | None = None) -> None:
-        """Put another state in place, all at once.
-
-        Args:
-            live: The episodes.
-            ends: bool [N, 2], where they have terminated or been truncated and wait for a reset;
-                None: nowhere.
-        """
-        self.__dict__.update(_live=live, _ends=ends, _count=self._count + 1)
-
-    def _ended(self) -> torch.Tensor:
-        """bool [N, 2], where episodes have terminated or been truncated and wait for a reset."""
-        if self._ends is not None:
-            return self._ends.clone()
-        return torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
-
-    def _waits_for_reset(self) -> bool:
-        """Whether an episode may have ended that was not reset; on a GPU nobody waits to see."""
-        return self._ends is not None and (not is_host(self.device) or bool(self._ends.any()))
-
-    def _stay_at_ends(self, after: Episodes, outcome: Outcome) -> tuple[Episodes, Outcome]:
-        """Take a step back where an episode had ended before it: there the flags are those of the
-        end, and the reward is 0.
-        """
-        ends = self._ended()
-        ended = jax.device_put(ends.any(1).cpu().numpy(), self._jax_device)
-        terminated, truncated = jax.device_put(ends.T.cpu().numpy(), self._jax_device)
-        at_end = Outcome(jnp.zeros_like(outcome.reward), terminated, truncated)
-        stays: tuple[Episodes, Outcome] = choose_rows(ended, (self._live, at_end), (after, outcome))
-        return stays
-
-    def _flag(self) -> Categorical:
-        return Categorical(2, shape=(self.num_envs, 1), dtype=torch.bool, device=self.device)
 
     def _observation_spec(self) -> Composite:
         """The spec of everything but action, reward and ends."""
@@ -275,53 +219,8 @@ class JaxEnv(BaseEnv):
         spec["episode_reward"] = Unbounded(shape, dtype=torch.float32, device=self.device)
         return spec
 
-    def _begin_anew(self, live: Episodes, mask: jax.Array) -> Episodes:
-        """Begin a new episode where ``mask`` (bool [N]) is true."""
-        obs, state = jax.vmap(self.suite.reset)(live.reset_key)
-        following = jax.vmap(jax.random.fold_in, in_axes=(0, None))(live.reset_key, 1)
-        fresh = live._replace(
-            reset_key=following,
-            state=state,
-            obs=obs,
-            step_count=jnp.zeros_like(live.step_count),
-            episode_reward=jnp.zeros_like(live.episode_reward),
-        )
-        chosen: Episodes = choose_rows(mask, fresh, live)
-        return chosen
-
-    def _advance(self, live: Episodes, action: jax.Array) -> tuple[Episodes, Outcome]:
-        """Take one action in every env.
-
-        Keys go as in gymnax's own ``step``: one for the step, one for the episode after it.
-        """
-        key, of_this_step = _split(live.key)
-        step_key, reset_key = _split(of_this_step)
-        count = live.step_count + 1
-        obs, state, outcome = jax.vmap(self.suite.step)(step_key, live.state, action, count)
-        total = live.episode_reward + outcome.reward
-        return Episodes(key, reset_key, state, obs, action, count, total), outcome
-
-    def _advance_and_begin_anew(
-        self, live: Episodes, action: jax.Array
-    ) -> tuple[Episodes, Episodes, Outcome]:
-        """Take one action, and begin anew where that ended an episode.
-
-        Returns:
-            What to go on with; observation and counts that the step led to, without the rest, since
-            every array that a compiled function gives is written; and what it gave.
-        """
-        after, outcome = self._advance(live, action)
-        root = self._begin_anew(after, outcome.terminated | outcome.truncated)
-        return root, after._replace(key=None, reset_key=None, state=None), outcome
-
-    def _advance_and_pack(
-        self, live: Episodes, action: jax.Array
-    ) -> tuple[Episodes, Any, jax.Array]:
-        """The same for a collector: what to go on with, the observation that the step led to, and
-        all numbers in one array.
-        """
-        root, after, outcome = self._advance_and_begin_anew(live, action)
-        return root, after.obs, pack_numbers(after, outcome)
+    def _flag(self) -> Categorical:
+        return Categorical(2, shape=(self.num_envs, 1), dtype=torch.bool, device=self.device)
 
     def _set_seed(self, seed: int | None) -> None:
         """Draw all episodes anew."""
@@ -330,15 +229,7 @@ class JaxEnv(BaseEnv):
         wait_for_torch(self.device, self._jax_device)
         with jax.default_device(self._jax_device):  # on another GPU than the first one, too
             keys = jax.device_put(env_keys(seed, self.num_envs), self._jax_device)
-            self._go_on(self._compiled_begin(keys))
-
-    def _begin(self, keys: jax.Array) -> Episodes:
-        """Episodes that begin."""
-        key, reset_key = _split(keys)
-        obs, state = jax.vmap(self.suite.reset)(reset_key)
-        action = jnp.zeros(tuple(self.action_spec.shape), self._action_dtype)
-        counts = jnp.zeros(len(keys), jnp.int32)
-        return Episodes(key, reset_key, state, obs, action, counts, counts.astype(jnp.float32))
+            self._go_on(self._batched.begin(keys))
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
         check_process()
@@ -349,12 +240,12 @@ class JaxEnv(BaseEnv):
         ends = None if rows.all() else self._ends
         if ends is not None:
             ends = ends & ~torch.from_numpy(rows).to(self.device).unsqueeze(-1)
-        self._go_on(self._compiled_begin_anew(self._live, rows), ends)
+        self._go_on(self._batched.begin_anew(self._live, rows), ends)
         return self._root()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = validation.tensor(tensordict, "action")
-        after, outcome = self._compiled_advance(self._live, self._argument(action))
+        after, outcome = self._batched.advance(self._live, self._argument(action))
         if self._waits_for_reset():
             after, outcome = self._stay_at_ends(after, outcome)
         following: TensorDictBase = self._next(after, outcome, action)
@@ -381,7 +272,7 @@ class JaxEnv(BaseEnv):
             return stock
         action = validation.tensor(tensordict, "action")
         argument = self._argument(action)
-        live, after, outcome = self._compiled_advance_and_begin_anew(self._live, argument)
+        live, after, outcome = self._batched.advance_and_begin_anew(self._live, argument)
         self._go_on(live)
         following = self._next(after, outcome, action)
         validation.keep_what_was_written(tensordict, following)
@@ -402,40 +293,72 @@ class JaxEnv(BaseEnv):
             return action.detach().to("cpu", dtype, copy=True).numpy()
         return to_jax(action.detach().to(dtype, copy=True))
 
+    def _go_on(self, live: Episodes, ends: torch.Tensor | None = None) -> None:
+        """Put another state in place, all at once.
+
+        Args:
+            live: The episodes.
+            ends: bool [N, 2], where they have terminated or been truncated and wait for a reset;
+                None: nowhere.
+        """
+        # ``nn.Module`` sets attributes slowly, and one by one
+        self.__dict__.update(_live=live, _ends=ends, _count=self._count + 1)
+
+    def _ended(self) -> torch.Tensor:
+        """bool [N, 2], where episodes have terminated or been truncated and wait for a reset."""
+        if self._ends is not None:
+            return self._ends.clone()
+        return torch.zeros(self.num_envs, 2, dtype=torch.bool, device=self.device)
+
+    def _waits_for_reset(self) -> bool:
+        """Whether an episode may have ended that was not reset; on a GPU nobody waits to see."""
+        return self._ends is not None and (not is_host(self.device) or bool(self._ends.any()))
+
+    def _stay_at_ends(self, after: Episodes, outcome: Outcome) -> tuple[Episodes, Outcome]:
+        """Take a step back where an episode had ended before it: there the flags are those of the
+        end, and the reward is 0.
+        """
+        ends = self._ended()
+        ended = jax.device_put(ends.any(1).cpu().numpy(), self._jax_device)
+        terminated, truncated = jax.device_put(ends.T.cpu().numpy(), self._jax_device)
+        at_end = Outcome(jnp.zeros_like(outcome.reward), terminated, truncated)
+        stays: tuple[Episodes, Outcome] = choose_rows(ended, (self._live, at_end), (after, outcome))
+        return stays
+
     def _root(self) -> TensorDict:
         """The root tensordict of the live episodes."""
-        live = self._live
-        step_count = to_torch(live.step_count, self.device).to(torch.int64).unsqueeze(-1)
+        last_action = to_torch(self._live.last_action, self.device)
         no = torch.zeros(self.num_envs, 1, dtype=torch.bool, device=self.device)
-        entries = self._observation(live.obs)
-        last_action = to_torch(live.last_action, self.device)
-        entries["last_action"] = last_action.to(self.action_spec.dtype, copy=True)
-        entries["is_init"] = step_count == 0
-        entries["step_count"] = step_count
-        episode_reward = to_torch(live.episode_reward, self.device)
-        entries["episode_reward"] = episode_reward.clone().unsqueeze(-1)
-        entries["done"] = no
-        entries["terminated"] = no.clone()
-        entries["truncated"] = no.clone()
-        return self._tensordict(entries)
+        return self._tensordict(self._entries(self._live, last_action, no, no.clone()))
 
     def _next(self, after: Episodes, outcome: Outcome, action: torch.Tensor) -> TensorDict:
         """The ``"next"`` tensordict."""
+        last_action = suite_actions.as_got(action)
         terminated = to_torch(outcome.terminated, self.device).unsqueeze(-1).clone()
         truncated = to_torch(outcome.truncated, self.device).unsqueeze(-1).clone()
-        step_count = to_torch(after.step_count, self.device).to(torch.int64)
-        entries = self._observation(after.obs)
-        last_action = suite_actions.as_got(action)
-        entries["last_action"] = last_action.to(self.action_spec.dtype, copy=True)
-        entries["is_init"] = torch.zeros_like(terminated)
-        entries["step_count"] = step_count.unsqueeze(-1)
-        episode_reward = to_torch(after.episode_reward, self.device)
-        entries["episode_reward"] = episode_reward.clone().unsqueeze(-1)
+        entries = self._entries(after, last_action, terminated, truncated)
         entries["reward"] = to_torch(outcome.reward, self.device).clone().unsqueeze(-1)
+        return self._tensordict(entries)
+
+    def _entries(
+        self,
+        episodes: Episodes,
+        last_action: torch.Tensor,
+        terminated: torch.Tensor,
+        truncated: torch.Tensor,
+    ) -> dict[Any, torch.Tensor]:
+        """The entries that root and ``"next"`` have in common; the flags are bool [N, 1]."""
+        step_count = to_torch(episodes.step_count, self.device).to(torch.int64).unsqueeze(-1)
+        episode_reward = to_torch(episodes.episode_reward, self.device).clone().unsqueeze(-1)
+        entries = self._observation(episodes.obs)
+        entries["last_action"] = last_action.to(self.action_spec.dtype, copy=True)
+        entries["is_init"] = step_count == 0
+        entries["step_count"] = step_count
+        entries["episode_reward"] = episode_reward
         entries["done"] = terminated | truncated
         entries["terminated"] = terminated
         entries["truncated"] = truncated
-        return self._tensordict(entries)
+        return entries
 
     def _observation(self, obs: Any) -> dict[Any, torch.Tensor]:
         """An observation by name, zero copy."""
@@ -452,43 +375,6 @@ class JaxEnv(BaseEnv):
         for name, value in entries.items():
             td.set(name, value)
         return td
-
-
-def _split(keys: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Two keys of each, uint32 [N, 2]."""
-    pairs = jax.vmap(jax.random.split)(keys)
-    return pairs[:, 0], pairs[:, 1]
-
-
-def _leaf_names(obs: Any, obs_key: str | None) -> list[Any]:
-    """A key of a tensordict for every leaf of an observation, a string or a tuple of strings."""
-    leaves = jax.tree_util.tree_flatten_with_path(obs)[0]
-    is_array = len(leaves) == 1 and not leaves[0][0]
-    paths = [tuple(jax.tree_util.keystr((key,), simple=True) for key in path) for path, _ in leaves]
-    if obs_key is not None and (not isinstance(obs_key, str) or not obs_key):
-        raise TypeError(f"obs_key is {obs_key!r}, expected a name")
-    if is_array:
-        array = leaves[0][1]
-        is_picture = array.dtype == np.uint8 and array.ndim == 4
-        paths = [(obs_key or ("pixels" if is_picture else "observation"),)]
-    elif obs_key is not None:
-        arrived = ", ".join("/".join(path) for path in paths)
-        raise ValueError(
-            f"obs_key is {obs_key!r}, and the observation has names of its own: {arrived}; leave "
-            "obs_key out"
-        )
-    for path in paths:
-        if "" in path:
-            raise ValueError(
-                "the observation has an entry with an empty name, for which TorchRL has no specs: "
-                "give it a name"
-            )
-        if path[0] in _OWN_KEYS:
-            raise ValueError(
-                f"the observation has an entry {path[0]!r}, which is a key of the env itself: "
-                "give it another name"
-            )
-    return [path[0] if len(path) == 1 else path for path in paths]
 
 
 def from_jax(

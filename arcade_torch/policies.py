@@ -91,8 +91,7 @@ class PolicyRunner:
             if is_carried and key not in state.keys(True, True):
                 raise KeyError(
                     f"the policy reads {key!r} and writes it for the next step, but has no primer "
-                    "that says how it "
-                    f"begins: give the module a method make_tensordict_primer()"
+                    "that says how it begins: give the module a method make_tensordict_primer()"
                 )
         self._initial = state
         return state.clone()

@@ -35,7 +35,7 @@ _ROOT_COLUMNS: dict[str, torch.dtype] = {
 
 
 class Entry(NamedTuple):
-    """Of what kind an entry is."""
+    """Shape and type of an entry."""
 
     shape: tuple[int, ...]  # of one env
     dtype: torch.dtype
@@ -82,7 +82,7 @@ class RolloutBuffer:
         overlap: Steps of the previous window that stand in front.
         steps: T, new steps a window.
         observation: The entries of an observation as it is stored, by key.
-        action: Of what kind an action is.
+        action: Shape and type of an action.
         device: Of the storage.
         final_frames: See ``ArcadeCollector``.
         max_steps: The shortest time limit of the games.
@@ -107,7 +107,7 @@ class RolloutBuffer:
         self.length = overlap + steps
         self.device = device
         self.final_frames = final_frames
-        self._action_kind = action
+        self._action_entry = action
         # Truncations of an env are max_steps apart: L - 1 steps hold so many at most. The last step
         # has its own place.
         inside = -(-(self.length - 1) // max_steps) if final_frames == "truncated" else 0
@@ -136,7 +136,7 @@ class RolloutBuffer:
         size = (self.num_envs, self.length)
         device = self.device
         self.observation = _taken(self._new_observation)
-        shape, dtype = self._action_kind
+        shape, dtype = self._action_entry
         self._action = torch.zeros((*size, *shape), dtype=dtype, device=device)
         self._last_action = torch.zeros_like(self._action)
         self._numbers = torch.zeros((*size, NUM_NUMBERS), dtype=torch.int32, device=device)
@@ -161,7 +161,7 @@ class RolloutBuffer:
         return self._numbers[..., TERMINATED:].any(-1)
 
     def begin(self, carry: bool, reuse: bool, dense: bool) -> int:
-        """Make ready for new steps, and say which is the first.
+        """Get ready for a window, and give the index of its first new step.
 
         Args:
             carry: Move the overlap to the front; otherwise it is filled anew.
@@ -278,6 +278,22 @@ class RolloutBuffer:
         Raises:
             RuntimeError: A game truncated earlier than at its time limit.
         """
+        self._write_roots(root)
+        for key, value in last.items():
+            self._final[key][:, -1] = value
+            if self._dense is not None and self._fills_dense:
+                self._dense[key][:, -1] = value
+        if self.final_frames == "none" or (self.final_frames == "all" and not self._fills_dense):
+            return np.zeros_like(self._wanted)
+        self._mark_wanted()
+        new = self._wanted.copy()
+        new[:, : self._first] = False
+        return new
+
+    def _write_roots(self, root: Mapping[NestedKey, torch.Tensor]) -> None:
+        """Write what the new steps began with: the first one with ``root``, each other one with the
+        outcome of the step before it.
+        """
         first = self._first
         for key, column in self._root.items():
             column[:, first] = root[key].reshape(self.num_envs)
@@ -292,12 +308,10 @@ class RolloutBuffer:
         self._root["step_count"][:, after] = step_count.masked_fill(done, 0)
         episode_reward = numbers[..., EPISODE_REWARD].view(torch.float32)
         self._root["episode_reward"][:, after] = episode_reward.masked_fill(done, 0)
-        for key, value in last.items():
-            self._final[key][:, -1] = value
-            if self._dense is not None and self._fills_dense:
-                self._dense[key][:, -1] = value
-        if self.final_frames == "none" or (self.final_frames == "all" and not self._fills_dense):
-            return np.zeros_like(self._wanted)
+
+    def _mark_wanted(self) -> None:
+        """Mark the new steps whose final observations are kept; the host waits for the flags."""
+        first = self._first
         flags = (self._numbers[:, first:, TERMINATED:] > 0).cpu().numpy()
         terminated = flags[..., 0]
         truncated = flags[..., 1]
@@ -309,9 +323,6 @@ class RolloutBuffer:
             raise RuntimeError(
                 "a game truncated an episode before its max_steps: collect with final_frames='all'"
             )
-        new = self._wanted.copy()
-        new[:, :first] = False
-        return new
 
     def keep_overlap(self) -> None:
         """Copy what the next window begins with, before somebody gets the batch; not bytes, of
@@ -393,7 +404,7 @@ class RolloutBuffer:
         return out
 
     def _entries(self, first: int, batch_size: list[int]) -> TensorDict:
-        """Everything but what follows a step's frame, from step ``first`` on."""
+        """All entries but the observations that follow the steps, from step ``first`` on."""
         numbers = self._numbers[:, first:]
         reward = numbers[..., REWARD, None].view(torch.float32)
         episode_reward = numbers[..., EPISODE_REWARD, None].view(torch.float32)
@@ -462,11 +473,7 @@ class RolloutBuffer:
         if not state:
             return
         state = _of_today(state)
-        for name, buffer in state["buffers"].items():
-            kind, *path = name.split("/")
-            if kind == "extras" and tuple(path) not in map(path_of, self._extras):
-                key = tuple(path) if len(path) > 1 else path[0]
-                self._add_extra(key, Entry(tuple(buffer.shape[2:]), buffer.dtype))
+        self._add_extras_of(state["buffers"])
         if self.final_frames == "all":
             self._dense = _taken(self._new_dense)
         ours = self._overlap_buffers() | _by_path(self._final, "final")
@@ -486,6 +493,14 @@ class RolloutBuffer:
             )
         self._wanted = wanted
         self.keep_overlap()
+
+    def _add_extras_of(self, buffers: Mapping[str, torch.Tensor]) -> None:
+        """Make space for what the policy wrote to saved buffers, [N, steps, ...] by path."""
+        for name, buffer in buffers.items():
+            kind, *path = name.split("/")
+            if kind == "extras" and tuple(path) not in map(path_of, self._extras):
+                key = tuple(path) if len(path) > 1 else path[0]
+                self._add_extra(key, Entry(tuple(buffer.shape[2:]), buffer.dtype))
 
 
 def _by_path(buffers: Mapping[NestedKey, torch.Tensor], *above: str) -> dict[str, torch.Tensor]:

@@ -197,8 +197,8 @@ def warn_state_is_dropped(*keys: NestedKey) -> None:
     names = ", ".join(".".join((key,) if isinstance(key, str) else key) for key in keys)
     warn(
         f"the policy wrote {names} for the next step, which does not get there, so a memory "
-        "forgets: act in "
-        "TransformedEnv(env, get_primers_from_module(policy)), or with ArcadeCollector"
+        "forgets: act in TransformedEnv(env, get_primers_from_module(policy)), or with "
+        "ArcadeCollector"
     )
 
 

@@ -47,8 +47,8 @@ class EnvParams(NamedTuple):
         if limit is not self.max_steps_in_episode and limit != self.max_steps_in_episode:
             raise ValueError(
                 f"max_steps_in_episode is {format_value(limit)}, allowed: "
-                f"{self.max_steps_in_episode}, the game's own "
-                "time limit; end episodes earlier by a wrapper"
+                f"{self.max_steps_in_episode}, the game's own time limit; end episodes earlier by "
+                "a wrapper"
             )
         return self._replace(**changes)
 

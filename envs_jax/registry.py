@@ -230,8 +230,8 @@ def _resolve_one(id: str) -> str:
     hint = f"did you mean {names[near[0]]!r}? " if near else ""
     raise ValueError(
         f"unknown env id {format_value(id)}: {hint}All ids: arcade_torch.registered_ids() or "
-        "'arcade-torch list'; a "
-        "game of your own has to be registered first, on the command line with --import"
+        "'arcade-torch list'; a game of your own has to be registered first, on the command line "
+        "with --import"
     )
 
 

@@ -127,8 +127,8 @@ def check_same(name: str, subject: str, first: Any, following: Any) -> None:
     if before != jax.tree.structure(following):
         raise ValueError(
             f"{name}: step gives {with_article(subject)} of another structure, with "
-            f"{', '.join(theirs) or 'nothing'}; wanted that of "
-            f"reset, {kind_of_traced(first)} with {', '.join(ours)}"
+            f"{', '.join(theirs) or 'nothing'}; wanted that of reset, {kind_of_traced(first)} with "
+            f"{', '.join(ours)}"
         )
     for leaf, wanted in ours.items():
         place = subject if leaf == subject else f"{subject} entry {leaf}"

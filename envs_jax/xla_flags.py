@@ -27,8 +27,7 @@ def guard_sums() -> None:
     if has_started or (flags and not flags.startswith("-")):
         warnings.warn(
             f"jaxlib {_jaxlib()} computes some sums wrongly on a CPU (issue 39103 of JAX): import "
-            "arcade_torch before "
-            f"JAX computes anything, or set XLA_FLAGS={FLAG}= in the shell",
+            f"arcade_torch before JAX computes anything, or set XLA_FLAGS={FLAG}= in the shell",
             stacklevel=2,
         )
         return

@@ -2,6 +2,7 @@
 breaks, or all laws one by one.
 """
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -66,7 +67,7 @@ def check_memory(
     discrepancies = {}
     with kept_generators(seed):
         for name, law in laws_of(module, subject.dtype, gradients).items():
-            discrepancies[name] = law(subject, name)
+            discrepancies[name] = law(replace(subject, law=name))
     return discrepancies
 
 
@@ -111,7 +112,7 @@ def law_results(
     with kept_generators(seed):
         for name, law in laws_of(module, subject.dtype, True).items():
             try:
-                results.append(LawResult(name, True, law(subject, name), ""))
+                results.append(LawResult(name, True, law(replace(subject, law=name)), ""))
             except MemoryLawError as error:
                 results.append(LawResult(name, False, error.discrepancy, str(error)))
             except Exception as error:

@@ -132,8 +132,7 @@ def _check_floats(pixels: Tensor) -> None:
     if 0.0 < largest <= 1.0:
         raise ValueError(
             f"frames of floats go up to {largest:.3g}, expected uint8, or floats from 0 to 255 "
-            "(not 0 to 1): "
-            "take ToTensorImage away, or multiply by 255"
+            "(not 0 to 1): take ToTensorImage away, or multiply by 255"
         )
 
 

@@ -15,24 +15,24 @@ CAUSE = (
 )
 
 
-def gradients_of(law: str, number: Tensor, inputs: list[Tensor]) -> tuple[Tensor, ...]:
+def gradients_of(s: Subject, number: Tensor, inputs: list[Tensor]) -> tuple[Tensor, ...]:
     """The gradient of a number, zeros where an input has no part in it."""
     if not number.requires_grad:
         raise MemoryLawError(
-            law, "no gradient comes from y to x", "torch.no_grad, a detach or .data"
+            s.law, "no gradient comes from y to x", "torch.no_grad, a detach or .data"
         )
     try:
         return torch.autograd.grad(number, inputs, allow_unused=True, materialize_grads=True)
     except RuntimeError as error:
         raise MemoryLawError(
-            law,
+            s.law,
             f"torch cannot compute the gradient ({' '.join(str(error).split())})",
             "an in-place write (h.mul_(), h[:] = ..., copy_()) into a tensor that the gradient of "
             "an earlier step reads: make a new one at every step, or write to a clone()",
         ) from error
 
 
-def gradients_are_right(s: Subject, law: str) -> float:
+def gradients_are_right(s: Subject) -> float:
     """Gradients equal finite differences, and a call a step, through the states that are returned,
     has those of one call.
     """
@@ -57,15 +57,15 @@ def gradients_are_right(s: Subject, law: str) -> float:
         torch.autograd.gradcheck(outputs, arguments, fast_mode=True, atol=1e-5, rtol=1e-3)
     except RuntimeError as error:  # gradcheck's own error class derives from it
         raise MemoryLawError(
-            law,
+            s.law,
             "autograd and finite differences disagree in float64 "
             f"({str(error).strip().splitlines()[0]})",
             CAUSE,
         ) from error
-    return gradients_of_steps(s, law)
+    return gradients_of_steps(s)
 
 
-def gradients_of_steps(s: Subject, law: str) -> float:
+def gradients_of_steps(s: Subject) -> float:
     """The gradient of one call is that of a call a step, as far as rounding lets them agree."""
     x, state, flags = s.inputs(2, 9)
     flags[0, 4] = True
@@ -74,12 +74,11 @@ def gradients_of_steps(s: Subject, law: str) -> float:
         lambda x: s.read_steps(x, state, flags)[0],
     ]
     symptom = "the gradients of one call and of a call a step differ"
-    return compare_gradients(s, law, symptom, CAUSE, x, reads)
+    return compare_gradients(s, symptom, CAUSE, x, reads)
 
 
 def compare_gradients(
     s: Subject,
-    law: str,
     symptom: str,
     cause: str,
     x: Tensor,
@@ -94,5 +93,5 @@ def compare_gradients(
     for read in reads:
         given = x.clone().requires_grad_()
         number = (weight * read(given)).sum()
-        gradients.append(gradients_of(law, number, [given, *parameters]))
-    return s.compare(law, symptom, cause, *zip(*gradients, strict=True))
+        gradients.append(gradients_of(s, number, [given, *parameters]))
+    return s.compare(symptom, cause, *zip(*gradients, strict=True))

@@ -49,6 +49,8 @@ class Subject:
     tolerance: float
     original: nn.Module
     """A copy in evaluation mode whose weights and buffers are of the types that they came in."""
+    law: str = ""
+    """Name of the law that is checked now."""
 
     def random(self, batch: int, steps: int) -> Tensor:
         """Random x [batch, steps, D] where the parameters are."""
@@ -94,7 +96,6 @@ class Subject:
 
     def compare(
         self,
-        law: str,
         symptom: str,
         cause: str,
         *pairs: tuple[Tensor, Tensor],
@@ -105,7 +106,8 @@ class Subject:
         # torch's maximum is NaN where one of them is, unlike Python's
         worst = float(torch.tensor([0.0, *differences], dtype=torch.float64).max())
         if not worst <= (self.tolerance if tolerance is None else tolerance):
-            raise MemoryLawError(law, f"{symptom} (largest difference {worst:.2g})", cause, worst)
+            measured = f"{symptom} (largest difference {worst:.2g})"
+            raise MemoryLawError(self.law, measured, cause, worst)
         return worst
 
 

@@ -14,12 +14,11 @@ __all__ = ["weights_are_registered"]
 
 
 @torch.no_grad()
-def weights_are_registered(s: Subject, law: str) -> float:
+def weights_are_registered(s: Subject) -> float:
     """All weights are parameters, there before the first call, and taken by name.
 
     Args:
         s: what is checked.
-        law: its name, for the error.
 
     Returns:
         0: it is no law of numbers.
@@ -30,7 +29,7 @@ def weights_are_registered(s: Subject, law: str) -> float:
     for name, weight in (*s.module.named_parameters(), *s.module.named_buffers()):
         if is_lazy(weight):
             symptom = f"{name} has no shape before the first call"
-            raise MemoryLawError(law, symptom, "nn.LazyLinear: take nn.Linear, with its sizes")
+            raise MemoryLawError(s.law, symptom, "nn.LazyLinear: take nn.Linear, with its sizes")
     registered = {id(weight) for weight in s.module.parameters()}
     for part in s.module.modules():
         for name, value in vars(part).items():
@@ -47,7 +46,7 @@ def weights_are_registered(s: Subject, law: str) -> float:
                     "function is given"
                 )
             raise MemoryLawError(
-                law,
+                s.law,
                 f"parameters() does not list what is in {name} of {type(part).__name__}, a "
                 f"{type(value).__name__}",
                 cause,
@@ -58,11 +57,11 @@ def weights_are_registered(s: Subject, law: str) -> float:
     module(x, s.initial(2), torch.zeros_like(x[..., 0], dtype=torch.bool))
     if new := set(module.state_dict()) - before:
         raise MemoryLawError(
-            law,
+            s.law,
             f"the first call makes new weights: {', '.join(sorted(new))}",
             "a layer made in forward, which the optimiser does not know: make it in __init__",
         )
-    _check_taken_by_name(s, law, x)
+    _check_taken_by_name(s, x)
     return 0.0
 
 
@@ -91,7 +90,7 @@ def _named_by(function: FunctionType) -> list[Any]:
     return things
 
 
-def _check_taken_by_name(s: Subject, law: str, x: Tensor) -> None:
+def _check_taken_by_name(s: Subject, x: Tensor) -> None:
     """Call it with ``parameters()`` empty and the numbers there by their names, as a loss with
     target networks does.
     """
@@ -106,7 +105,7 @@ def _check_taken_by_name(s: Subject, law: str, x: Tensor) -> None:
         bare.initial_state(len(x))  # type: ignore[operator]
     except Exception as error:
         raise MemoryLawError(
-            law,
+            s.law,
             "it fails where a loss with target networks keeps the parameters elsewhere, "
             f"{type(error).__name__} {error}".rstrip(),
             "self.parameters() in forward or initial_state: take weights by name, such as "

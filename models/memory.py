@@ -10,9 +10,12 @@ from torch import Tensor, nn
 from arcade_torch.models.arguments import check_sizes, is_whole
 
 __all__ = [
-    "Memory", "MemoryContract", "ReplayableMemory", "batch_shape", "first_state", "replay",
-    "replay_by_steps",
+    "MASKS", "Memory", "MemoryContract", "ReplayableMemory", "batch_shape", "first_state", "replay",
+    "replay_by_steps", "step_mask",
 ]  # fmt: skip
+
+MASKS: tuple[str | tuple[str, ...], ...] = ("mask", ("collector", "mask"))
+"""Where TorchRL says which steps are no padding."""
 
 
 @runtime_checkable
@@ -284,3 +287,15 @@ def first_state(memory: nn.Module, batch_size: int | Sequence[int]) -> TensorDic
             'TensorDict({"h": ...}, batch_size=[batch_size])'
         )
     return state
+
+
+def step_mask(batch: TensorDictBase, shape: torch.Size) -> Tensor | None:
+    """Which steps are no padding, bool of this shape [..., T]; None if the batch does not say."""
+    masks = []
+    for key in MASKS:
+        mask = batch.get(key, None)
+        if isinstance(mask, Tensor) and mask.shape in (shape, (*shape, 1)):
+            masks.append(mask.reshape(shape).bool())
+    if not masks:
+        return None
+    return masks[0] & masks[-1]

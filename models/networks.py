@@ -13,8 +13,8 @@ from torch.nn import functional as F
 
 from arcade_torch.models.arguments import check_sizes, is_whole
 from arcade_torch.models.encoders import Encoder
-from arcade_torch.models.memory import batch_shape, first_state, replay
-from arcade_torch.models.recurrence import Key, Recurrence, Store, padding_mask
+from arcade_torch.models.memory import batch_shape, first_state, replay, step_mask
+from arcade_torch.models.recurrence import Key, Recurrence, Store
 from arcade_torch.models.registry import make_memory
 
 if TYPE_CHECKING:
@@ -23,45 +23,6 @@ if TYPE_CHECKING:
 __all__ = ["MemoryBlock", "MemoryNetwork"]
 
 SKIPS = ("residual", "none")
-
-
-def check_memory_name(memory: Any) -> None:
-    """Refuse what is neither the name of a memory nor a factory (TypeError)."""
-    is_made = isinstance(memory, nn.Module)
-    if isinstance(memory, str) or (callable(memory) and not is_made):
-        return
-    got = f"the {type(memory).__name__} that is made already" if is_made else repr(memory)
-    raise TypeError(
-        "memory has to be a name, such as 'lru', or a factory that makes one of the width it is "
-        f"asked for, lambda input_size, hidden_size: ..., got {got}"
-    )
-
-
-def _check_steps(features: Tensor, last_action: Any, is_init: Any) -> None:
-    """Refuse last actions and start flags that are not one a step (ValueError): other shapes would
-    be stretched over the batch.
-    """
-    lead = features.shape[:-1]
-    _check_one_a_step("last_action", "whole numbers", last_action, lead)
-    _check_one_a_step("is_init", "bool", is_init, lead)
-
-
-def _check_one_a_step(name: str, kind: str, value: Any, lead: Sequence[int]) -> None:
-    given = type(value).__name__
-    if isinstance(value, Tensor):
-        fits = value.dtype == torch.bool if kind == "bool" else not value.is_floating_point()
-        if fits and list(value.shape) == list(lead):
-            return
-        given = f"{value.dtype} {list(value.shape)}"
-    raise ValueError(f"{name} must be {kind} {list(lead)}, one a step, got {given}")
-
-
-def _mean_of_steps(values: Tensor, mask: Tensor | None) -> Tensor:
-    """The mean [E] of numbers [..., T, E] over the steps that a mask [..., T, 1] counts."""
-    if mask is None:
-        return values.flatten(0, -2).mean(0)
-    count = mask.sum().clamp_min(1)
-    return values.where(mask, 0).flatten(0, -2).sum(0) / count
 
 
 class MemoryBlock(nn.Module):
@@ -310,7 +271,7 @@ class MemoryNetwork(TensorDictModuleBase):
             x = self._append(x, tensordict["last_action"], is_init)
         y = self.recurrence.read(self.block, tensordict, x)
         if self.predictor is not None and self.recurrence.recurrent_mode:
-            mask = padding_mask(tensordict, tensordict.batch_size)
+            mask = step_mask(tensordict, tensordict.batch_size)
             tensordict.set("prediction_error", self.prediction_error(x, y, is_init, mask))
         for name, value in self.by_head(self.head(y)).items():
             tensordict.set(name, value)
@@ -433,7 +394,7 @@ class MemoryNetwork(TensorDictModuleBase):
         return self.block.initial_state(batch_size)  # type: ignore[operator]
 
     def _apply(self, *args: Any, **options: Any) -> "MemoryNetwork":
-        """Fill in what no checkpoint holds: behind ``to_empty`` it is any numbers."""
+        """Fill ``actions`` again: no checkpoint holds it, ``to_empty`` leaves any numbers in it."""
         super()._apply(*args, **options)
         if torch.is_inference_mode_enabled() or not self.actions.is_inference():
             self.actions.copy_(torch.arange(self.num_actions, device=self.actions.device))
@@ -448,3 +409,42 @@ class MemoryNetwork(TensorDictModuleBase):
         if self.zero_action_on_reset:
             one_hot = one_hot & ~is_init.unsqueeze(-1)
         return torch.cat([features, one_hot.to(features.dtype)], dim=-1)
+
+
+def check_memory_name(memory: Any) -> None:
+    """Refuse what is neither the name of a memory nor a factory (TypeError)."""
+    is_made = isinstance(memory, nn.Module)
+    if isinstance(memory, str) or (callable(memory) and not is_made):
+        return
+    got = f"the {type(memory).__name__} that is made already" if is_made else repr(memory)
+    raise TypeError(
+        "memory has to be a name, such as 'lru', or a factory that makes one of the width it is "
+        f"asked for, lambda input_size, hidden_size: ..., got {got}"
+    )
+
+
+def _check_steps(features: Tensor, last_action: Any, is_init: Any) -> None:
+    """Refuse last actions and start flags that are not one a step (ValueError): torch would
+    broadcast other shapes over the batch.
+    """
+    lead = features.shape[:-1]
+    _check_one_a_step("last_action", "whole numbers", last_action, lead)
+    _check_one_a_step("is_init", "bool", is_init, lead)
+
+
+def _check_one_a_step(name: str, kind: str, value: Any, lead: Sequence[int]) -> None:
+    given = type(value).__name__
+    if isinstance(value, Tensor):
+        fits = value.dtype == torch.bool if kind == "bool" else not value.is_floating_point()
+        if fits and list(value.shape) == list(lead):
+            return
+        given = f"{value.dtype} {list(value.shape)}"
+    raise ValueError(f"{name} must be {kind} {list(lead)}, one a step, got {given}")
+
+
+def _mean_of_steps(values: Tensor, mask: Tensor | None) -> Tensor:
+    """The mean [E] of numbers [..., T, E] over the steps that a mask [..., T, 1] counts."""
+    if mask is None:
+        return values.flatten(0, -2).mean(0)
+    count = mask.sum().clamp_min(1)
+    return values.where(mask, 0).flatten(0, -2).sum(0) / count

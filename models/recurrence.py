@@ -13,12 +13,12 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
 
-from arcade_torch.models.memory import first_state, replay
+from arcade_torch.models.memory import first_state, replay, step_mask
 
 if TYPE_CHECKING:
     from torchrl.envs import TensorDictPrimer
 
-__all__ = ["Key", "Recurrence", "SequenceChecks", "Store", "padding_mask"]
+__all__ = ["Key", "Recurrence", "SequenceChecks", "Store"]
 
 Key = str | tuple[str, ...]
 Store = Literal["step", "sequence"]
@@ -344,20 +344,10 @@ def _no_ends(tensordict: TensorDictBase, shape: torch.Size) -> Tensor | bool:
     done = _entry(tensordict, "done", shape)
     if done is not None:
         goes_on = ~done[..., :-1]
-    mask = padding_mask(tensordict, shape)
+    mask = step_mask(tensordict, shape)
     if mask is not None:
         goes_on = goes_on & mask[..., 1:] & mask[..., :-1]
     return goes_on
-
-
-def padding_mask(tensordict: TensorDictBase, shape: torch.Size) -> Tensor | None:
-    """Which steps are no padding, bool [*, T]; None if the batch does not say."""
-    counted = None
-    for key in ("mask", ("collector", "mask")):
-        mask = _entry(tensordict, key, shape)
-        if mask is not None and mask.dtype == torch.bool:
-            counted = mask if counted is None else counted & mask
-    return counted
 
 
 def _numbers(tensordict: TensorDictBase, shape: torch.Size) -> dict[str, tuple[Tensor, Tensor]]:

@@ -19,7 +19,6 @@ MOST_LINES = 60
 MOST_LINES_OF_A_FILE = 450
 LONGER_FILES = {
     "arcade_torch/env.py": "one class, TorchRL's methods",
-    "arcade_torch/jax_env.py": "the same for the envs of other suites",
     "arcade_torch/collector.py": "one class, TorchRL's protocol of collectors",
     "arcade_torch/rollout_buffer.py": "one class, a window that is written, read, saved and loaded",
     "tools/measures/counterfactual/measure.py": "a measure is one file that is imported alone",

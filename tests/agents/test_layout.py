@@ -8,7 +8,8 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictSequential
 from torch import nn
 
-from arcade_torch.agents.layout import NetworkInputs, as_steps, insert_final_observations, unroll
+from arcade_torch.agents.batch_checks import NetworkInputs
+from arcade_torch.agents.layout import as_steps, insert_final_observations, unroll
 from arcade_torch.models import MemoryModule
 from tests.agents.fakes import stream
 

@@ -9,17 +9,19 @@ import torch
 
 from arcade_torch.agents import (
     CheckpointError,
-    NonFiniteError,
     evaluate,
     load,
     preset,
     train,
-    training,
 )
 from arcade_torch.agents.config import TrainConfig
-from arcade_torch.agents.runs.checkpoint import list_checkpoints
 from arcade_torch.agents.runs.files import read_csv
-from tests.agents.test_training import assert_same_run, kill_and_resume, stop_after, weights
+from tests.agents.test_training import (
+    assert_a_nan_stops,
+    assert_same_run,
+    kill_and_resume,
+    stop_after,
+)
 
 ALGORITHMS = ("ppo", "dqn")  # PQN: test_training
 CHANGES = {
@@ -108,28 +110,7 @@ def test_without_any_whole_replay_the_run_is_refused(whole, tmp_path):
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_a_nan_stops_the_run_and_the_last_good_checkpoint_stays(algorithm, tmp_path, monkeypatch):
-    made, real = [], training.Trainer
-
-    def spy(*args):
-        made.append(real(*args))
-        return made[-1]
-
-    monkeypatch.setattr(training, "Trainer", spy)
-
-    def poison():
-        next(made[0].network.parameters()).data.view(-1)[0] = torch.nan
-
-    words = (
-        r"update 4 \(after 192 frames\): the loss is nan at gradient step 1 of .*last good "
-        r"checkpoint is .*128"
-    )
-    with pytest.raises(NonFiniteError, match=words):
-        train(config(algorithm), tmp_path / "run", progress=stop_after(3, poison))
-    assert [p.name for p in list_checkpoints(tmp_path / "run" / "checkpoints")] == [
-        "frames-000000000128"
-    ]
-    assert all(w.isfinite().all() for w in weights(tmp_path / "run").values())
-    monkeypatch.undo()
+    assert_a_nan_stops(config(algorithm), tmp_path / "run", monkeypatch)
     assert train(config(algorithm), tmp_path / "run", resume=True).status == "finished"
 
 

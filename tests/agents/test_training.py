@@ -244,7 +244,8 @@ def test_a_damaged_newest_checkpoint_costs_only_the_way_since_the_one_before(who
     assert_same_run(tmp_path / "run", whole[0])
 
 
-def test_a_nan_stops_the_run_and_names_where(tmp_path, monkeypatch):
+def assert_a_nan_stops(config, folder, monkeypatch):
+    """A weight becomes NaN behind the checkpoint of frame 128, which is what the run leaves."""
     made = []
     real = training.Trainer
 
@@ -252,23 +253,27 @@ def test_a_nan_stops_the_run_and_names_where(tmp_path, monkeypatch):
         made.append(real(*args))
         return made[-1]
 
-    monkeypatch.setattr(training, "Trainer", spy)
-
     def poison():
         next(made[0].network.parameters()).data.view(-1)[0] = torch.nan
 
     words = (
-        r"update 4 \(after 192 frames\): the loss is nan at gradient step 1 of 8; the last good "
+        r"update 4 \(after 192 frames\): the loss is nan at gradient step 1 of .*last good "
         r"checkpoint is .*128"
     )
-    with pytest.raises(NonFiniteError, match=words):
-        train(CONFIG, tmp_path / "run", progress=stop_after(3, poison))
-    assert [p.name for p in list_checkpoints(tmp_path / "run" / "checkpoints")] == [
-        "frames-000000000128"
-    ]
-    assert all(w.isfinite().all() for w in weights(tmp_path / "run").values())
+    with monkeypatch.context() as patched:
+        patched.setattr(training, "Trainer", spy)
+        with pytest.raises(NonFiniteError, match=words):
+            train(config, folder, progress=stop_after(3, poison))
+    names = [path.name for path in list_checkpoints(folder / "checkpoints")]
+    assert names == ["frames-000000000128"]
+    assert all(w.isfinite().all() for w in weights(folder).values())
+
+
+def test_a_nan_stops_the_run_and_names_where(tmp_path, monkeypatch):
+    assert_a_nan_stops(CONFIG, tmp_path / "run", monkeypatch)
     assert load(tmp_path / "run").frames == 128
-    assert "loss is nan" in json.loads((tmp_path / "run" / "progress.json").read_text())["error"]
+    error = json.loads((tmp_path / "run" / "progress.json").read_text())["error"]
+    assert "the loss is nan at gradient step 1 of 8" in error
 
 
 def test_a_resumed_learner_keeps_the_tensor_that_its_step_size_is_on_a_gpu() -> None:

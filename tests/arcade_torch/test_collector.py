@@ -23,6 +23,7 @@ from arcade_torch.collector import ArcadeCollector
 from arcade_torch.compiled import CompiledGame
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.final_observations import _OneGame
+from tests.arcade_torch.same import assert_same
 from tests.arcade_torch.stub import GAME, LOCKSTEP, MIXED, StubGame
 from tests.few import a_third
 
@@ -70,14 +71,6 @@ class Recurrent(nn.Module):
         td["action"] = (total.squeeze(-1) * 7).long() % 5
         td["total"] = td["next", "memory", "sum"] = total
         return td
-
-
-def assert_same(one: TensorDictBase, two: TensorDictBase) -> None:
-    """Same keys, same bits."""
-    keys = set(one.keys(True, True))
-    assert keys == set(two.keys(True, True))
-    different = [key for key in keys if not torch.equal(one[key], two[key])]
-    assert not different, different
 
 
 def steps(batch: TensorDictBase) -> TensorDictBase:

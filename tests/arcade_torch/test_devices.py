@@ -156,7 +156,7 @@ FrameMemory.show = shown
 with jax.default_device(jax.devices()[1]):
     env = ArcadeEnv(LOCKSTEP, 6)
     env.rollout(12, break_when_any_done=False)
-print(used == {(id(memory), jax.devices()[0]) for memory in (env._memory, env._ends)})
+print(used == {(id(memory), jax.devices()[0]) for memory in (env._memory, env._final_memory)})
 """
     options = {"XLA_FLAGS": "--xla_force_host_platform_device_count=2", "PYTHONPATH": str(ROOT)}
     assert output_of(code, options) == "True"

@@ -15,6 +15,7 @@ from arcade_torch.compiled import CompiledGame
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.envs_jax.batch import env_keys
 from arcade_torch.factory import make
+from tests.arcade_torch.same import assert_same
 from tests.arcade_torch.stub import GAME, LOCKSTEP, MIXED
 
 N = 6
@@ -29,14 +30,6 @@ def scripted(td: TensorDictBase) -> TensorDictBase:
     pixels = td["pixels"][:, :, 0, 0].long()
     td["action"] = (pixels.sum(-1) + 3 * td["step_count"].squeeze(-1) + td["last_action"]) % 5
     return td
-
-
-def assert_same(one: TensorDictBase, two: TensorDictBase) -> None:
-    """Same keys, same bits."""
-    keys = set(one.keys(True, True))
-    assert keys == set(two.keys(True, True))
-    different = [key for key in keys if not torch.equal(one[key], two[key])]
-    assert not different, different
 
 
 def stock_rollout(env: ArcadeEnv, steps: int) -> TensorDict:

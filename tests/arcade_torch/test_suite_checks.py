@@ -309,7 +309,7 @@ def test_python_numbers_in_a_state_change_no_type_and_compile_nothing_twice() ->
     env = made(env_with(reset=begin, step=narrow))
     seen = env.rollout(5, break_when_any_done=False)["next", "observation"]
     assert seen.dtype is torch.float16 and seen[0, :, 0].tolist() == [0, 1, 2, 0, 1]
-    assert env._compiled_advance_and_begin_anew._cache_size() == 1
+    assert env._batched.advance_and_begin_anew._cache_size() == 1
 
 
 def test_a_class_in_the_place_of_an_env_is_refused_unless_it_needs_no_self() -> None:

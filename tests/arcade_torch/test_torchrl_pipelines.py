@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import nn
 from torchrl.collectors import Collector
@@ -24,6 +24,7 @@ from torchrl.objectives.value import GAE
 
 from arcade_torch.collector import ArcadeCollector
 from arcade_torch.env import ArcadeEnv
+from tests.arcade_torch.same import assert_same
 from tests.arcade_torch.stub import GAME
 
 N, T = 6, 16
@@ -50,13 +51,6 @@ def recurrent_policy() -> TensorDictSequential:
     head = TensorDictModule(nn.Linear(8, 5), ["hidden"], ["action_value"])
     greedy = QValueModule(spec=stub_env().action_spec_unbatched, action_space="categorical")
     return TensorDictSequential(encoder(), memory, head, greedy)
-
-
-def assert_same(one: TensorDictBase, two: TensorDictBase) -> None:
-    keys = set(one.keys(True, True))
-    assert keys == set(two.keys(True, True))
-    different = [key for key in keys if not torch.equal(one[key], two[key])]
-    assert not different, different
 
 
 def test_a_recurrent_policy_gives_the_data_of_torchrls_collector_with_a_primer() -> None:

@@ -11,19 +11,7 @@ from arcade_torch.models import make_network
 from arcade_torch.models.actor_critic import ActorCriticNetwork, make_actor_critic
 from arcade_torch.models.presets import make_head
 from arcade_torch.models.stateless import FeedForward
-
-
-def count(module):
-    return sum(p.numel() for p in module.parameters())
-
-
-def run(network, pixels, last_action, is_init, state):
-    return network.remember(network.encode(pixels), last_action, is_init, state)
-
-
-def inputs(batch=2, steps=5, size=32):
-    pixels = torch.randint(0, 256, (batch, steps, size, size, 3), dtype=torch.uint8)
-    return pixels, torch.randint(0, 5, (batch, steps)), torch.rand(batch, steps) < 0.3
+from tests.models.pixels import count, inputs, run
 
 
 def test_the_feed_forward_network_has_the_published_size_and_no_last_action():

@@ -15,21 +15,9 @@ from arcade_torch.models import (
     make_network,
 )
 from arcade_torch.models.presets import HEADS, make_head
+from tests.models.pixels import count, inputs, run
 
 CELLS = {"lru": 1_050_624, "gru": 1_574_400, "mingru": 525_312, "mlp": 262_656}
-
-
-def count(module):
-    return sum(p.numel() for p in module.parameters())
-
-
-def run(network, pixels, last_action, is_init, state):
-    return network.remember(network.encode(pixels), last_action, is_init, state)
-
-
-def inputs(batch=2, steps=5, size=32):
-    pixels = torch.randint(0, 256, (batch, steps, size, size, 3), dtype=torch.uint8)
-    return pixels, torch.randint(0, 5, (batch, steps)), torch.rand(batch, steps) < 0.3
 
 
 @pytest.mark.parametrize("memory", CELLS)

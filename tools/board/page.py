@@ -238,10 +238,10 @@ def _reported(results: Path) -> list[str]:
         "## Reported, not checked",
         "Other protocols, so other tables: nothing above is compared with these. The paper's rows "
         "are means of its five seeds by its training score, under the published rules, and its "
-        "people; a row is the interquartile mean of the ten means. The two rows of this "
-        "repository are greedy returns of 1,024 episodes of another evaluation seed, AutoEncode "
-        "and Navigator under the published rules, of runs in "
-        "[small/easy.csv](../results/small/easy.csv): reported, checkpoints not kept.",
+        "people; a row is the interquartile mean of the ten means. The two rows of this repository "
+        "are greedy returns of 1,024 episodes of another evaluation seed, AutoEncode and Navigator "
+        "under the published rules, of runs in [small/easy.csv](../results/small/easy.csv): "
+        "reported, checkpoints not kept.",
         markdown_table(("agent", "POMDP", "MDP", "of"), lines, left=1),
     ]
 

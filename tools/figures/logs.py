@@ -251,9 +251,9 @@ def throughput(options: Options, progress: Progress | None) -> Made:
     machine = read_csv(file)[0]  # the same in every row
     note = (
         f"{smallest} px, every frame consumed by a checksum inside the clock; median of repeats, "
-        "no interval; "
-        f"{machine.get('jax_device', 'unknown device')}, {machine.get('cores', '?')} cores, "
-        f"arcade-torch {machine.get('arcade_torch', '?')} ({machine.get('commit') or 'no commit'})"
+        f"no interval; {machine.get('jax_device', 'unknown device')}, {machine.get('cores', '?')} "
+        f"cores, arcade-torch {machine.get('arcade_torch', '?')} "
+        f"({machine.get('commit') or 'no commit'})"
     )
     return Made([Picture("throughput", figure, note, numbers)], notes)
 

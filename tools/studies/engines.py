@@ -364,9 +364,8 @@ def _check_node(ray: Any) -> None:
     """Raise if the one machine of a cluster of our own, which began with all cores, is gone."""
     if not ray.cluster_resources().get("CPU"):
         raise ClusterLostError(
-            "Ray's node on this machine is gone (killed, or out of memory); "
-            "finished runs are kept, "
-            "the same command goes on with the others"
+            "Ray's node on this machine is gone (killed, or out of memory); finished runs are "
+            "kept, the same command goes on with the others"
         )
 
 

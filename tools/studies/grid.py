@@ -200,8 +200,7 @@ class Study:
         if not find_baselines(names, self.baseline):
             raise ValueError(
                 f"baseline = {self.baseline!r} is none of the agents that this study trains, "
-                f"{', '.join(names)}: "
-                "add it to memories, or name one of them"
+                f"{', '.join(names)}: add it to memories, or name one of them"
             )
 
     def require_subject(self) -> None:

@@ -151,8 +151,8 @@ def _note(
     frames = "one frame" if options.block == 1 else f"{options.block} consecutive frames"
     return (
         f"{sample}; {options.episodes} decisions each, {frames} exchanged for those of up to "
-        f"{options.donors} other episodes at the same step; "
-        f"{STATE}: everything before the last frame is the other episode's"
+        f"{options.donors} other episodes at the same step; {STATE}: everything before the last "
+        "frame is the other episode's"
     )
 
 

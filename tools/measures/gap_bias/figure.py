@@ -339,8 +339,7 @@ def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
         seeds = (SEEDS,) * len(paper.table.tasks)
         note = (
             f"published returns, {len(seeds)} tasks, n = {SEEDS} seeds; bars: normal 95 % "
-            "interval, tasks independent "
-            "(bootstrap intervals of the gap would cover "
+            "interval, tasks independent (bootstrap intervals of the gap would cover "
             f"{100 * measured_coverage(seeds, seeds):.0f} %)"
         )
         return Made(tables=[paper.printed()]), paper.table, note
