@@ -2,6 +2,7 @@
 
 import abc
 import functools
+import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, Generic, Literal, Protocol, TypeVar
 
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from arcade_torch.envs_jax.settings import fixed, may_be_nan, raw_key
+from arcade_torch.envs_jax.validation import format_value
 
 Array = jax.Array
 Rules = Literal["default", "reference"]
@@ -29,6 +31,8 @@ MEMORY_KINDS = {
     "none": "nothing: a player without memory can earn the most",
 }
 """What a POMDP twin can ask of a memory."""
+# arguments of a game's class that are no options of ``make``
+_NO_OPTIONS = ("level", "id", "obs_size", "rules")
 # such a flag in a state that no wrapped method of ``Game`` gave, or of an episode that runs
 UNSET: Any = None
 
@@ -295,8 +299,12 @@ class Game(abc.ABC, Generic[State]):
         return following, stepped, (reward, terminated, truncated)
 
     def __repr__(self) -> str:
-        """The call that makes this game again."""
-        return f"make({self.id!r}, obs_size={self.obs_size}, rules={self.rules!r})"
+        """The call that makes this game again, with the options that it keeps under their names."""
+        arguments = [repr(self.id), f"obs_size={self.obs_size}", f"rules={self.rules!r}"]
+        for name in inspect.signature(type(self)).parameters:
+            if name not in _NO_OPTIONS and hasattr(self, name):
+                arguments.append(f"{name}={format_value(getattr(self, name))}")
+        return f"make({', '.join(arguments)})"
 
 
 class Screen(Protocol[Drawn]):

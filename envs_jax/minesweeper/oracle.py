@@ -57,8 +57,10 @@ class FramesOracle(FramesPlayer):
 
     Keeps the chance of a mine in each covered cell by fitting independent odds to all numbers seen
     and to the number of mines (iterative proportional fitting), sweeps the nearest cell that is
-    surely safe, and otherwise the least likely mine. Its return stays below 1 for two reasons that
-    no memory mends: the first sweeps are guesses, and the time limit.
+    surely safe, and otherwise the least likely mine. No memory mends that the first sweeps are
+    guesses, and the time limit. But it is no best player: the fit is not exact, so that it now and
+    then sweeps a mine where another cell is surely safe, and it does not plan ahead. On Easy the
+    best play that remembers everything returns 0.847, computed over all that can be known.
 
     Args:
         game: The MineSweeper to play.

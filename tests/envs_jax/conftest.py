@@ -75,13 +75,11 @@ def one(game, **changes):
 
 
 _steps = {}
-# of all games: what changes their steps, but for the difficulty
-_OPTIONS = ("id", "rules", "mine_reward", "move_budget")
 
 
 def step(game, state, action):
     """One step with key 0, compiled once a game: state, reward, terminated, truncated."""
-    key = tuple(getattr(game, name, None) for name in _OPTIONS)
+    key = repr(game)
     if key not in _steps:
         _steps[key] = jax.jit(game.step)
     new, reward, terminated, truncated = _steps[key](jax.random.PRNGKey(0), state, np.int32(action))
@@ -100,7 +98,7 @@ _compiled = {}
 
 def draw(game, state, partial):
     """The frame of one state as a numpy array, by a renderer compiled once a game."""
-    key = (repr(game), getattr(game, "arrow", None))
+    key = repr(game)
     if key not in _compiled:
         _compiled[key] = jax.jit(game.render)
     return np.asarray(_compiled[key](state, partial))

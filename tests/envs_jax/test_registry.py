@@ -15,6 +15,7 @@ from arcade_torch.envs_jax import (
     resolve_id,
 )
 from arcade_torch.envs_jax.registry import is_built_in
+from arcade_torch.envs_jax.signpost import Signpost
 from tests.own_registry import forget_games
 
 
@@ -91,6 +92,38 @@ def test_a_penalty_that_is_no_number_is_refused(id, option, wrong):
     with pytest.raises(TypeError) as error:
         make(id, **{option: wrong})
     assert str(error.value) == f"{option} is {wrong!r}, expected a number from -1 to 0"
+
+
+@pytest.mark.parametrize(
+    ("id", "options"),
+    [
+        ("AutoEncodeEasy", {"mdp_marker": False}),
+        ("BreakoutHard", {"tail": "previous", "random_start": True}),
+        ("CartPoleEasy", {"arrow": "linear"}),
+        ("CountRecallEasy", {"move_budget": 7}),
+        ("MineSweeperEasy", {"mine_reward": -0.5}),
+        ("SkittlesEasy", {"hit_reward": -1.0}),
+    ],
+)
+def test_the_text_of_a_game_makes_it_again_with_its_options(id, options):
+    game = make(id, **options)
+    again = eval(repr(game), {"make": make})
+    assert {name: getattr(again, name) for name in options} == options
+    assert repr(again) == repr(game) != repr(make(id))
+
+
+def test_the_text_of_a_game_of_ones_own_has_the_options_that_it_keeps(monkeypatch):
+    class Own(Signpost):
+        def __init__(self, *, id, obs_size, rules, kept=3, lost=4):
+            level = Signpost.levels["SignpostEasy"]
+            super().__init__(level, id=id, obs_size=obs_size, rules=rules)
+            self.kept = kept
+
+    forget_games(monkeypatch)
+    register("OwnEasy-v0", Own)
+    assert repr(make("OwnEasy", kept=5)) == (
+        "make('OwnEasy-v0', obs_size=128, rules='default', kept=5)"
+    )
 
 
 def test_options_are_listed():
