@@ -11,6 +11,7 @@ import tyro
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.runs.files import check_writable, read_json, write_json
+from arcade_torch.envs_jax import resolve_id
 from arcade_torch.tools.imports import existing_agent, import_again, imports_of, load_agent
 from arcade_torch.tools.memory_files import LateImports, check_memory_of
 from arcade_torch.tools.options import Command, at_least, command_line, name_and_value
@@ -184,7 +185,7 @@ class Evaluate(Command):
         result = evaluate(agent, self.observability, self.episodes, game=self.game)
         config = agent.config
         twin = self.observability or agent.config.observability
-        game = self.game or config.env
+        game = resolve_id(self.game or config.env)
         which = f"{config.algorithm}-{config.memory} on {game} ({twin}), seed {config.seed}"
         say(f"{which}, {agent.frames:,} frames of training: {result.text}")
         _say_each_game(result)
