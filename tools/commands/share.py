@@ -98,7 +98,12 @@ class Pull(Command):
         )
         from arcade_torch.agents.runs.files import checksum
         from arcade_torch.tools.sharing.place import FILMS, put_files
-        from arcade_torch.tools.sharing.share import EVALUATION, README, RESULTS
+        from arcade_torch.tools.sharing.share import (
+            EVALUATION,
+            README,
+            RESULTS,
+            check_recorded,
+        )
 
         if self.sha256 is not None:
             check_hash(self.sha256)
@@ -127,6 +132,7 @@ class Pull(Command):
         for name in (CONFIG, WEIGHTS, *extras):
             if (source / name).is_file():
                 files[name] = read_bytes(source / name, sizes[name])
+        check_recorded(files)
         put_files(files, out)
         config = agent.config
         say(f"{config.algorithm}-{config.memory} on {config.env} ({config.observability})")
