@@ -92,12 +92,12 @@ def check_recorded(files: Mapping[str, bytes]) -> None:
     except (KeyError, TypeError, ValueError, RecursionError):
         return
     for name in (WEIGHTS, CONFIG):
-        known = recorded.get(name) if isinstance(recorded, dict) else None
+        expected = recorded.get(name) if isinstance(recorded, dict) else None
         measured = hashlib.sha256(files[name]).hexdigest()
-        if known not in (None, measured):
+        if expected not in (None, measured):
             raise CheckpointError(
-                f"{name} has the SHA-256 {measured}, {RESULTS} says {known}: the file is damaged, "
-                "or the results are of another agent; nothing was written"
+                f"{name} has the SHA-256 {measured}, {RESULTS} says {expected}: the file is "
+                "damaged, or the results are of another agent; nothing was written"
             )
 
 
