@@ -349,6 +349,25 @@ def _check_weights(path: Path, saved: dict[str, Tensor], wanted: dict[str, Tenso
             )
 
 
+def _check_size(checkpoint: Checkpoint) -> None:
+    """Raise CheckpointError, before memory is taken for it, for a network far larger than the
+    weights: settings may be a stranger's.
+    """
+    sizes: Network | None = None
+    # what these options are refused for, `build_network` says; a memory may need real numbers
+    with suppress(Exception), torch.device("meta"):
+        sizes = _new_network(checkpoint.config)
+    if sizes is None:
+        return
+    wanted = sum(value.numel() for value in sizes.state_dict().values())
+    held = sum(value.numel() for value in checkpoint.weights.values())
+    if wanted > 2 * held:  # weights of an older version may lack some
+        raise CheckpointError(
+            f"the settings in {checkpoint.path} are of a network of {wanted:,} numbers, its "
+            f"weights hold {held:,}: they were changed, or are of another agent"
+        )
+
+
 def load(path: str | PathLike[str], device: str | torch.device | None = None) -> Agent:
     """Load an agent.
 
@@ -375,6 +394,7 @@ def agent_of(checkpoint: Checkpoint, device: str | torch.device | None = None) -
     if device is not None:
         device = device_of(device)
     config = checkpoint.config
+    _check_size(checkpoint)
     network = build_network(replace(config, device="cpu", cuda_graphs=False))
     weights = checkpoint.weights
     if isinstance(network, ActorCriticNetwork):

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 from arcade_torch.agents.runs.files import read_bytes, read_json, write_json
 from arcade_torch.agents.runs.shipped import agent_folder, agents_hint
 from arcade_torch.tools.errors import one_line
+from arcade_torch.tools.text import warn
 
 if TYPE_CHECKING:
     from arcade_torch.agents.config import TrainConfig
@@ -104,9 +105,10 @@ def import_for_command(names: Sequence[str]) -> None:
     chosen = [[name, _hashes[name]] for name in names if name in _hashes]
     if not chosen:
         return
-    # without a home, or on a disk that takes no files, --import has to be given every time
-    with contextlib.suppress(OSError, RuntimeError):
+    try:
         _note(chosen)
+    except (OSError, RuntimeError) as error:  # no home, or a disk that takes no files
+        warn(f"later commands need {FLAG} again: no record of it is kept ({one_line(error)})")
 
 
 def _note(chosen: Sequence[list[str]]) -> None:

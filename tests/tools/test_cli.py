@@ -72,6 +72,8 @@ def test_every_command_explains_itself_with_an_example(
     # under --no-report, "Write the report. (default: True)" would say what the option does not do
     options = text.partition(" -h, --help ")[2]  # usage and description stand above
     assert set(re.findall(r"\B--no-[\w-]+ (\w+)", options)) <= {"Whether"}
+    for option in re.findall(r"\B--(no-.*?)(?= --|$)", options):
+        assert "(default" not in option, "of what the option switches off: it reads as its own"
 
 
 @pytest.mark.parametrize(
@@ -466,6 +468,7 @@ def test_a_config_file_that_is_none_is_one_line(
         ("{", "does not hold JSON"),
         ("[]", "holds no config"),
         ('{"x": 1}', "unknown field 'x'"),
+        ('{"format": 2, "config": {}, "seed": 1}', "looked at: seed; move them into it"),
     ):
         file.write_text(content)
         assert message in one_error(capsys, ["train", "--config", str(file)])

@@ -317,3 +317,15 @@ def test_a_worker_imports_what_its_study_began_with(
     assert "yours" not in memory_names()
     imports.load_extensions([str(file)])  # the user names it himself
     assert "yours" in memory_names()
+
+
+def test_a_record_that_cannot_be_kept_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The run of such a file was refused later: it had never been imported on this machine."""
+    (tmp_path / "state").touch()
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setenv(VARIABLE, "")
+    (tmp_path / "mine.py").write_text("NOTHING = 0\n")
+    assert cli.main(["list", "envs", "--import", str(tmp_path / "mine.py")]) == cli.EXIT_OK
+    assert capsys.readouterr().err.startswith("later commands need --import again: no record")

@@ -31,7 +31,7 @@ def test_evaluate_says_what_each_game_gave(run: Path, capsys: pytest.CaptureFixt
 
     assert cli.main(["evaluate", str(run), "--episodes", "6", "--game", "SkittlesHard"]) == 0
     (line,) = capsys.readouterr().out.splitlines()
-    assert line.startswith("ppo-mingru on SkittlesHard (full)")
+    assert line.startswith("ppo-mingru on SkittlesHard-v0 (full)")
 
 
 def test_a_measure_asks_for_one_game(

@@ -1,5 +1,6 @@
 """``arcade-torch new memory``: a file that keeps the laws and learns, and overwrites nothing."""
 
+import resource
 import runpy
 from pathlib import Path
 from typing import Any
@@ -70,6 +71,21 @@ def test_nothing_is_overwritten(path: Path, capsys: pytest.CaptureFixture[str]) 
     capsys.readouterr()
     assert "my_own.py exists: choose another name" in one_error(capsys, ["new", "memory", "my_own"])
     assert path.read_text() == "mine"
+
+
+def test_a_file_that_could_not_be_written_whole_can_be_written_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An empty file was left, and "my_own.py exists" was the answer from then on."""
+    monkeypatch.chdir(tmp_path)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        said = one_error(capsys, ["new", "memory", "my_own"], cli.EXIT_FAILED)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "could not write my_own.py" in said
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

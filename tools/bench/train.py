@@ -18,6 +18,7 @@ from arcade_torch.agents.presets import preset
 from arcade_torch.agents.trainer import Trainer
 from arcade_torch.tools.bench.harness import Measure, interleaved
 from arcade_torch.tools.bench.registry import BenchOptions
+from arcade_torch.tools.commands import Unless
 from arcade_torch.tools.machine import torch_threads
 from arcade_torch.tools.options import at_least
 
@@ -55,7 +56,7 @@ class Options(BenchOptions):
     grad_steps: int = 4  # Gradient steps in each timed pass; those of an update are all alike.
     repeats: int = 3  # Passes; the median counts.
     # Whether the C library keeps freed memory, as train does and a loop of your own does not.
-    keep_memory: bool = True
+    keep_memory: Unless = True
 
 
 def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dict[str, Any]]]:

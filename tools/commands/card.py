@@ -8,6 +8,7 @@ import tyro
 
 from arcade_torch.agents.runs.files import check_writable_folder, write_atomic, write_json
 from arcade_torch.tools.cards.study import FRAMES, GAMES, SEEDS
+from arcade_torch.tools.commands import Unless
 from arcade_torch.tools.imports import is_from_user
 from arcade_torch.tools.options import Command, at_least, command_line
 from arcade_torch.tools.progress import Bars
@@ -32,13 +33,13 @@ class Card(Command):
     """Memory models; by default the only one that --import registers."""
     all: bool = False  # All that are registered.
     # Whether it is trained in the tests of memory, where no results are on file.
-    tests: bool = True
+    tests: Unless = True
     study: bool = False  # Train agents with it.
     frames: int = FRAMES  # Of each run of the study.
     games: tuple[str, ...] = GAMES  # Of the study, on both twins.
     seeds: int = SEEDS  # Of each agent of the study.
     workers: int = 0  # Runs of the study at once; 0 for one a core.
-    html: bool = True  # Whether the page is written beside the JSON.
+    html: Unless = True  # Whether the page is written beside the JSON.
     out: Path = Path("cards")  # Folder of the files: NAME.html and NAME.json.
 
     def run(self) -> int:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from arcade_torch.agents.checked import require
+from arcade_torch.tools.commands import Unless
 from arcade_torch.tools.commands.study import Resumable, check_memories_of
 from arcade_torch.tools.figures import Part
 from arcade_torch.tools.imports import is_from_user
@@ -44,7 +45,7 @@ class Compare(Resumable):
     workers: int = 0  # Runs at once; 0 for one a core.
     skip: tuple[Part, ...] = ("contamination",)  # Parts that the report leaves out, see report.
     # Whether the laws that a memory has to keep are checked before models of yours are trained.
-    check_memory: bool = True
+    check_memory: Unless = True
 
     def run(self) -> int:
         """Train, and write the report; exit code 1 if a run failed."""

@@ -10,7 +10,7 @@ from pathlib import Path
 import tyro
 
 from arcade_torch.agents.checked import require
-from arcade_torch.agents.runs.files import check_writable
+from arcade_torch.agents.runs.files import check_writable, write_atomic
 from arcade_torch.tools.options import Command
 from arcade_torch.tools.text import say
 
@@ -38,9 +38,7 @@ class NewMemory(Command):
         is_shadow = path.stem in sys.stdlib_module_names or find_spec(path.stem) is not None
         if is_shadow:
             raise ValueError(f"{path} would hide the module {path.stem} of Python: choose another")
-        check_writable(path).parent.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
+        write_atomic(check_writable(path), text)
         say(f"written: {path}; change it, and then")
         file_word = shlex.quote(str(path))
         words = f"--import {file_word} --memory {self.name}"

@@ -9,6 +9,7 @@ import tyro
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import check_writable_folder, read_bytes
 from arcade_torch.agents.runs.shipped import agent_folder
+from arcade_torch.tools.commands import Unless
 from arcade_torch.tools.imports import existing_agent, import_again
 from arcade_torch.tools.options import Command, at_least
 from arcade_torch.tools.text import counted, say
@@ -34,7 +35,7 @@ class Push(Command):
     """Repository owner/name; or a folder: one that is there, or a name that begins with . or /"""
     episodes: int = 1024  # Greedy ones, for the results.
     half: bool = False  # Store the weights as float16; both returns stand in results.json.
-    film: bool = True  # Whether a film of an episode is written.
+    film: Unless = True  # Whether a film of an episode is written.
     private: bool = False  # Make a private repository.
     message: str = "Add an agent"  # Of the commit.
 
@@ -97,7 +98,12 @@ class Pull(Command):
         )
         from arcade_torch.agents.runs.files import checksum
         from arcade_torch.tools.sharing.place import FILMS, put_files
-        from arcade_torch.tools.sharing.share import EVALUATION, README, RESULTS
+        from arcade_torch.tools.sharing.share import (
+            EVALUATION,
+            README,
+            RESULTS,
+            check_recorded,
+        )
 
         if self.sha256 is not None:
             check_hash(self.sha256)
@@ -126,6 +132,7 @@ class Pull(Command):
         for name in (CONFIG, WEIGHTS, *extras):
             if (source / name).is_file():
                 files[name] = read_bytes(source / name, sizes[name])
+        check_recorded(files)
         put_files(files, out)
         config = agent.config
         say(f"{config.algorithm}-{config.memory} on {config.env} ({config.observability})")

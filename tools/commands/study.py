@@ -10,6 +10,7 @@ import tyro
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import check_writable
+from arcade_torch.tools.commands import Unless
 from arcade_torch.tools.figures import Part
 from arcade_torch.tools.options import Command, command_line
 from arcade_torch.tools.studies.engines import Engine, Inline, RayOptions
@@ -111,9 +112,9 @@ class StudyCommand(Resumable):
     # The agent that the report is about and compares with every other; that of the file by default.
     subject: str = ""
     # Whether the laws that a memory has to keep are checked before models of yours are trained.
-    check_memory: bool = True
+    check_memory: Unless = True
     # Whether an HTML report is written at the end; of shards, by the one that finishes the study.
-    report: bool = True
+    report: Unless = True
 
     def run(self) -> int:
         """Run the study; exit code 1 if a run failed."""

@@ -11,6 +11,8 @@ import tyro
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.runs.files import check_writable, read_json, write_json
+from arcade_torch.envs_jax import resolve_id
+from arcade_torch.tools.commands import Unless
 from arcade_torch.tools.imports import existing_agent, import_again, imports_of, load_agent
 from arcade_torch.tools.memory_files import LateImports, check_memory_of
 from arcade_torch.tools.options import Command, at_least, command_line, name_and_value
@@ -51,7 +53,7 @@ class Train(Command):
     resume: bool = False  # Go on with the run in that folder.
     # Seconds to wait until another process that trains in that folder has stopped.
     wait: float = 0.0
-    check_memory: bool = True
+    check_memory: Unless = True
     """Whether the laws that a memory has to keep are checked before a model of yours is trained
     (about a second).
     """
@@ -184,7 +186,7 @@ class Evaluate(Command):
         result = evaluate(agent, self.observability, self.episodes, game=self.game)
         config = agent.config
         twin = self.observability or agent.config.observability
-        game = self.game or config.env
+        game = resolve_id(self.game or config.env)
         which = f"{config.algorithm}-{config.memory} on {game} ({twin}), seed {config.seed}"
         say(f"{which}, {agent.frames:,} frames of training: {result.text}")
         _say_each_game(result)
@@ -221,10 +223,16 @@ def _read_config(file: Path) -> TrainConfig:
             f"no config at {file}: give the config.json of a run, or one that a study wrote"
         )
     values = read_json(file)
+    if isinstance(values, dict) and "config" in values:
+        misplaced = {setting.name for setting in fields(TrainConfig)} & set(values)
+        if misplaced:
+            raise ValueError(
+                f'{file} has settings outside of its table "config", where they would not be '
+                f"looked at: {', '.join(sorted(misplaced))}; move them into it"
+            )
+        values = values["config"]
     try:
-        return TrainConfig.from_dict(
-            values["config"] if isinstance(values, dict) and "config" in values else values
-        )
+        return TrainConfig.from_dict(values)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{file} holds no config: {error}") from error
 

@@ -1,5 +1,6 @@
 """The figures by name: what each shows, its options, who makes it."""
 
+from dataclasses import fields
 from importlib import import_module
 from typing import NamedTuple
 
@@ -149,6 +150,8 @@ def make_figure(name: str, options: Options, progress: Progress | None = None) -
         raise ValueError("name at least one run folder")
     if entry.several and options.out is not None and options.out.suffix in (*PICTURES, *NUMBERS):
         raise ValueError(f"this figure has several files: give a folder, not --out {options.out}")
+    if isinstance(options, PaperOptions) and options.paper:
+        _check_paper(options)
     _check_out(options)
     module, _, maker = entry.maker.rpartition(".")
     make = getattr(import_module(f"arcade_torch.tools.{module}"), maker)
@@ -163,6 +166,23 @@ def make_figure(name: str, options: Options, progress: Progress | None = None) -
             "take --out NAME.svg"
         )
     return result
+
+
+def _check_paper(options: PaperOptions) -> None:
+    """Refuse what would not be looked at beside ``--paper``."""
+    if options.runs:
+        raise ValueError(
+            "--paper draws published numbers in the place of runs, and these are named: "
+            f"{', '.join(map(str, options.runs))}; leave out one of the two"
+        )
+    of_all = {option.name for option in fields(PaperOptions)}
+    for option in fields(options):
+        value = getattr(options, option.name)
+        if option.name not in of_all and value != option.default:
+            raise ValueError(
+                "--paper draws published numbers as they are: leave out "
+                f"--{option.name}, got {value}"
+            )
 
 
 def _check_out(options: Options) -> None:

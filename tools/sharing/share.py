@@ -1,7 +1,10 @@
 """A run as a folder that can be shared: weights, settings, results, model card, film."""
 
+import hashlib
+import json
 import tempfile
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +19,13 @@ from arcade_torch.agents.runs.bundle import (
     load_bundle,
     write_bundle,
 )
-from arcade_torch.agents.runs.files import checksum, read_json, write_atomic, write_json
+from arcade_torch.agents.runs.files import (
+    CheckpointError,
+    checksum,
+    read_json,
+    write_atomic,
+    write_json,
+)
 from arcade_torch.envs_jax.registry import games_of
 from arcade_torch.tools.errors import MissingPackage
 from arcade_torch.tools.imports import remembered_imports
@@ -72,6 +81,24 @@ def share(
         results = _write(run, draft, repo, episodes, half, film)
         put_files(read_folder(draft), folder)
     return results
+
+
+def check_recorded(files: Mapping[str, bytes]) -> None:
+    """Refuse (``CheckpointError``) an agent whose results name other hashes than those of its
+    files; one without results, or whose results name none, is not refused.
+    """
+    try:
+        recorded = json.loads(files[RESULTS])["sha256"]
+    except (KeyError, TypeError, ValueError, RecursionError):
+        return
+    for name in (WEIGHTS, CONFIG):
+        expected = recorded.get(name) if isinstance(recorded, dict) else None
+        measured = hashlib.sha256(files[name]).hexdigest()
+        if expected not in (None, measured):
+            raise CheckpointError(
+                f"{name} has the SHA-256 {measured}, {RESULTS} says {expected}: the file is "
+                "damaged, or the results are of another agent; nothing was written"
+            )
 
 
 def _write(

@@ -132,6 +132,17 @@ def test_settings_of_no_agent_are_refused(about: Any, message: str, tmp_path: Pa
         load_bundle(tmp_path)
 
 
+def test_settings_of_a_network_that_is_far_larger_are_refused_before_it_is_made(
+    checkpoint: Checkpoint, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A ``config.json`` of some bytes took all memory: the kernel ended the process."""
+    large = replace(checkpoint.config, network_options={"hidden_size": 32768})
+    write_bundle(tmp_path, replace(checkpoint, config=large), {})
+    monkeypatch.setattr("arcade_torch.agents.policy.build_network", None)
+    with pytest.raises(CheckpointError, match=r"a network of [\d,]+ numbers, its weights hold"):
+        from_pretrained(tmp_path)
+
+
 def test_a_missing_file_is_named(checkpoint: Checkpoint, tmp_path: Path) -> None:
     write_bundle(tmp_path, checkpoint, {})
     (tmp_path / "config.json").unlink()

@@ -185,6 +185,28 @@ def test_a_film_of_the_agent_before_does_not_stay(pushed: Path) -> None:
     assert from_pretrained(pushed, sha256=sha256).config.observability == "full"
 
 
+@pytest.mark.parametrize("name", ["model.safetensors", "config.json"])
+def test_files_that_are_not_those_of_the_results_are_not_pulled(
+    name: str, pushed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Weights with one bit turned were pulled, beside results that were not theirs."""
+    results = read_json(pushed / "results.json")
+    results["sha256"][name] = "0" * 64
+    write_json(pushed / "results.json", results)
+    out = tmp_path / "pulled"
+    said = one_error(capsys, ["pull", str(pushed), "--out", str(out)])
+    assert name in said and f"results.json says {'0' * 64}" in said
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '{"sha256": 3}', '{"sha256": {}}'])
+def test_an_agent_without_hashes_in_its_results_is_pulled(
+    text: str, pushed: Path, tmp_path: Path
+) -> None:
+    (pushed / "results.json").write_text(text)
+    assert cli.main(["pull", str(pushed), "--out", str(tmp_path / "pulled")]) == 0
+
+
 def test_what_could_not_be_pulled_whole_can_be_pulled_again(
     pushed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
