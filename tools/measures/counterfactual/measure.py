@@ -414,6 +414,11 @@ class Exchange:
         distance = (distribution - clean_distribution).abs().sum(-1) / 2
         best = before[0].topk(2).values
         change = (after[:, action] - before[0, action]).abs() / (best[0] - best[1])
+        # where the best actions tie there is no gap to measure by, and what stays the same has not
+        # changed
+        is_same = (after == before).all(-1)
+        distance = torch.where(is_same, 0.0, distance)
+        change = torch.where(is_same, 0.0, change)
 
         def where_exchanged(values: Tensor) -> Array:
             finite = values.isfinite().numpy() & np.isfinite(differs)
