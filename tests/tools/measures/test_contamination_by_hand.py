@@ -1,5 +1,6 @@
 """Contamination beside a replay in numpy: noise, seeds, start flags and states of long episodes."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -87,18 +88,27 @@ def noisy_frames(encoded: list[Tensor], env: ToyEnv, seeds: set[int]) -> Array:
     return np.stack([frame for key, frame in noisy.items() if key not in known])
 
 
-@pytest.mark.parametrize("cap", [512, 5])
-def test_noise_and_changes_are_those_of_a_replay_by_hand(cap: int) -> None:
+@pytest.mark.parametrize(("cap", "clip"), [(512, False), (5, False), (512, True)])
+def test_noise_and_changes_are_those_of_a_replay_by_hand(cap: int, clip: bool) -> None:
     policy, encoded = noting_policy()
     env = BrightEnv(LENGTHS)
     delays = (0, 1, 3)
     found = contamination(
-        policy, env, sigmas=SIGMAS, delays=delays, starts=16, seed=2, cap=cap, white=WHITE
+        policy,
+        env,
+        sigmas=SIGMAS,
+        delays=delays,
+        starts=15,
+        seed=2,
+        cap=cap,
+        clip=clip,
+        white=WHITE,
     )
+    assert len(found.points) == 15 and np.isnan(found.kl).all() and found.clean_error < 1e-9
     windows = list(greedy_windows(policy, env, episodes=20, seed=2, cap=cap))
     assert any(window.first > 0 for window in windows) == (cap == 5)
     noisy = noisy_frames(encoded, env, {window.seed for window in windows})
-    noisy = noisy.reshape(16, len(SIGMAS), *noisy.shape[1:])
+    noisy = noisy.reshape(15, len(SIGMAS), *noisy.shape[1:])
     draws = []
     for point, (number, place) in enumerate(found.points):
         window = windows[number]
@@ -122,7 +132,10 @@ def test_noise_and_changes_are_those_of_a_replay_by_hand(cap: int) -> None:
                 wanted = abs(after - before).max() / np.ptp(before)
                 assert change == pytest.approx(wanted, rel=1e-9)
                 assert flip == (before.argmax() != after.argmax())
-    weak, strong = np.stack(draws).reshape(16, 2, -1).swapaxes(0, 1)
+    assert (noisy.min() >= 0 and noisy.max() <= WHITE) == clip
+    if clip:
+        return
+    weak, strong = np.stack(draws).reshape(15, 2, -1).swapaxes(0, 1)
     np.testing.assert_allclose(weak, strong, atol=1e-9)  # one draw for all strengths
     assert weak.mean() == pytest.approx(0, abs=0.15) and weak.std() == pytest.approx(1, abs=0.1)
     assert len(np.unique(weak.round(6))) > 0.99 * weak.size  # and another one for every point
@@ -173,3 +186,17 @@ def test_noise_of_an_example_has_its_strength_and_is_clipped_at_white(clip: bool
     assert (noisy.min() >= 0 and noisy.max() <= WHITE) == clip
     if not clip:
         assert noise.std() == pytest.approx(0.5, abs=0.1)
+
+
+def test_the_clean_error_is_what_encoding_a_frame_alone_does() -> None:
+    policy, _ = noting_policy()
+    step = 1e-6
+
+    def encode(pixels: Tensor) -> Tensor:
+        return policy.encode(pixels) + step * len(pixels)
+
+    together = replace(policy, encode=encode)
+    found = contamination(together, OneEnv([9]), sigmas=(0.3,), delays=(0,), starts=4, white=WHITE)
+    _, head = matrices()
+    wanted = step * 8 * abs(head.numpy().sum(1)).max()  # eight frames less than in the episode
+    assert found.clean_error == pytest.approx(wanted, rel=1e-4)

@@ -1,5 +1,6 @@
 """Counterfactual recall beside an exchange in numpy, of windows that begin late in their episodes."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -222,3 +223,36 @@ def test_the_seed_draws_the_episodes_that_are_played_and_their_ends() -> None:
     ends = counterfactual(memory, ToyEnv(lengths), episodes=4, end="random").lengths
     assert ends.tolist() != lengths and ends.min() >= 3
     assert counterfactual(memory, ToyEnv(lengths), episodes=4, cap=5).lengths.tolist() == [5] * 4
+
+
+def test_pasts_differ_by_frames_actions_or_states_and_short_episodes_are_dropped() -> None:
+    one = windows()[1]
+    other_frames = replace(one, frames=255 - one.frames)
+    other_actions = replace(one, last_action=one.last_action + 1)
+    other_state = replace(one, state=one.state + 1)
+    last = one.frames.clone()
+    last[-1] = 0
+    other_decision = replace(one, frames=last)
+    for other, differs in (
+        (one, 0),
+        (other_frames, 1),
+        (other_actions, 1),
+        (other_state, 1),
+        (other_decision, 0),
+    ):
+        found = counterfactual_of_windows(policy("q"), [one, other, one.up_to(1)], donors=1)
+        assert found.memory_differs.tolist() == [[differs], [differs]]
+        assert found.dropped == 1 and len(found.lengths) == 2
+
+
+def test_the_clean_error_is_what_running_many_versions_does() -> None:
+    alone = policy("q")
+    step = 1e-6
+
+    def remember(features: Tensor, *others: Any) -> tuple[Tensor, Any]:
+        out, state = alone.remember(features, *others)
+        return out + step * len(features), state
+
+    together = replace(alone, remember=remember)
+    found = counterfactual_of_windows(together, windows(), donors=2)
+    assert found.clean_error == pytest.approx(step * 2 * found.lengths.max(), rel=1e-6)
