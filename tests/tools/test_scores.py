@@ -127,6 +127,14 @@ def test_of_a_study_without_its_runs_the_settings_of_the_finished_ones_are_compa
     file.write_text(json.dumps(study.config(first).to_dict() | {"rules": "reference"}))
     with pytest.raises(ValueError, match="runs with rules default and reference"):
         read_scores(lost)
+    # one whose settings are lost, or lie outside of the study, is not compared
+    file.rename(lost / file.name)
+    assert len(read_scores(lost)) == 8
+    table = (lost / "results.csv").read_text()
+    (lost / "results.csv").write_text(table.replace(first.name, f"../{first.name}"))
+    assert len(read_scores(lost)) == 8
+    (lost / "results.csv").write_text(table)
+    (lost / file.name).rename(file)
     # one that has not finished has no score, and says nothing
     rows = read_csv(lost / "results.csv")
     place = next(line for line, row in enumerate(rows) if row["run"] == first.name)
