@@ -1,15 +1,17 @@
 """Scores of runs and of tables, with one name for every agent and every game."""
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from arcade_torch.agents.checked import require
+from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.tools.comparable import Runs, check_comparable, find_runs
-from arcade_torch.tools.names import AgentKey, agent_names, game_names
+from arcade_torch.tools.names import AgentKey, agent_names, bare_name, game_names
 from arcade_torch.tools.run_folders import RunFolders
 from arcade_torch.tools.runs import Run, Score, described
 
@@ -18,6 +20,8 @@ METRICS = ("eval_final", "train_max_ewm")
 smoothed training score.
 """
 Source = str | Path | Sequence[str | Path] | Iterable[Score]
+Played = dict[tuple[str, str], tuple[str, str]]
+"""Game and setting, ``rules`` or ``options`` -> its value, and where that stands."""
 NamedScore = tuple[AgentKey, Score]
 """A score, and the agent that it belongs to; the name in the score is not filled in yet."""
 
@@ -61,6 +65,7 @@ def read_scores(runs: Source, metric: str = "eval_final") -> list[Score]:
     settings: list[Run] = []  # of the runs behind the scores, as far as they are known
     folders: list[Path] = []
     tables: dict[Path, Path] = {}
+    played: Played = {}
     for part in parts:
         if isinstance(part, Score):
             named.append((AgentKey("", part.agent), part))
@@ -75,8 +80,9 @@ def read_scores(runs: Source, metric: str = "eval_final") -> list[Score]:
         settings += finished.runs
         for run, score in zip(finished.runs, finished.scores(metric), strict=True):
             named.append((run.key, score))
+            _check_played(played, run.game, str(run.path), _played_by(run))
     for table in tables.values():
-        named += _read_table(table, metric)
+        named += _read_table(table, metric, played)
         settings += _runs_of_table(table)
     scores = _with_one_name(named)
     _check_cells(scores)
@@ -149,7 +155,31 @@ def _runs_of_table(table: Path) -> list[Run]:
     return runs
 
 
-def _read_table(path: Path, metric: str) -> list[NamedScore]:
+def _played_by(run: Run) -> dict[str, str]:
+    """By what rules and options of its game a run was made, as a table says it."""
+    options = run.config.get("env_options") or {}
+    return {
+        "rules": str(run.config.get("rules", TrainConfig.rules)),
+        "options": json.dumps(options, sort_keys=True),
+    }
+
+
+def _check_played(played: Played, game: str, source: str, settings: Mapping[str, str]) -> None:
+    """Refuse scores of a game that was played by other rules or options elsewhere; what a table
+    does not say is not compared, nor the size of frames, which is another for people.
+    """
+    for name, value in settings.items():
+        if not value:
+            continue
+        before, where = played.setdefault((bare_name(game), name), (value, source))
+        if value != before:
+            raise ValueError(
+                f"{game} was played with {name} {before} in {where} and with {value} in {source}: "
+                "give scores with one of them"
+            )
+
+
+def _read_table(path: Path, metric: str, played: Played) -> list[NamedScore]:
     """The scores in a table, with the agents that it names."""
     rows = _rows(path)
     columns = _columns(path, list(rows[0]) if rows else [], metric)
@@ -166,6 +196,12 @@ def _read_table(path: Path, metric: str) -> list[NamedScore]:
                 f"{path}: {game} has scores of rules, obs_size and options {before} and "
                 f"{settings}: keep one"
             )
+        _check_played(
+            played,
+            game,
+            str(path),
+            {"rules": row.get("rules") or "", "options": row.get("options") or ""},
+        )
         key = AgentKey(row.get("algorithm") or "", row[columns["agent"]])
         named.append((key, _score(path, row, columns)))
     return named

@@ -238,6 +238,18 @@ def test_a_single_seed_of_one_side_leaves_no_interval_of_the_difference() -> Non
     )
 
 
+def test_a_difference_of_bias_has_an_interval_where_the_memory_free_agents_have() -> None:
+    """Before: those of two algorithms with one seed each counted as if they were known exactly."""
+    many, one = [0.1, 0.2, 0.4], [0.3]
+    seeds = {"pqn-mlp": one, "ppo-mlp": one, "pqn-lru": many, "ppo-lru": many, "pqn-gru": many}
+    values = {(agent, twin): seeds[agent] for agent in seeds for twin in ("full", "partial")}
+    table = gap_and_bias(scores(values), draws=50)
+    assert np.isnan(table.difference("bias", "pqn-lru", "ppo-lru").low)
+    # the same one cancels
+    alike = table.difference("bias", "pqn-lru", "pqn-gru")
+    assert alike == table.difference("mdp", "pqn-lru", "pqn-gru") and alike.low < alike.high
+
+
 def test_raw_returns_stay_as_they_are_and_only_the_normalised_ones_are_mapped() -> None:
     values = {
         (agent, twin): [-0.5, 0.5, 0.6] for agent in ("mlp", "lru") for twin in ("full", "partial")

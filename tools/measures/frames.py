@@ -111,3 +111,14 @@ def pictures(
         colours = torch.tensor(table, dtype=shares.dtype, device=shares.device) / BYTE
         shares = (shares.unsqueeze(-1) * colours).amax(-2)
     return np.asarray((BYTE * shares).round().byte().cpu().numpy())
+
+
+def check_range(frames: Tensor, white: float) -> None:
+    """Refuse frames that clipping to 0 to ``white`` would change, noise or none (ValueError)."""
+    lowest = float(frames.min())
+    highest = float(frames.max())
+    if lowest < 0 or highest > white:
+        raise ValueError(
+            f"clip=True keeps pixels in 0 to {white:g}, got frames from {lowest:g} to "
+            f"{highest:g}: leave clip out, or name white="
+        )

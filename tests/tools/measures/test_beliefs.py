@@ -162,6 +162,20 @@ def test_the_dual_form_is_the_primal_one() -> None:
     np.testing.assert_allclose(primal.weights(0.1), wanted, rtol=1e-8, atol=1e-12)
 
 
+def test_an_input_that_is_constant_but_for_rounding_is_not_read() -> None:
+    """Before: the mean of many .1 is not quite .1, and this was taken for the input's spread."""
+    inputs = rng(0).normal(size=(320, 2))
+    targets = rng(1).normal(size=(320, 1))
+    new = rng(2).normal(size=(50, 2))
+    wanted = Ridge.of(inputs, targets).predict(new, [1e-6])[0]
+    for constant in (0.1, 1000.1):
+        beside = np.column_stack([inputs, np.full(320, constant)])
+        assert beside[:, 2].std() > 0  # the rounding is there
+        other = np.column_stack([new, np.full(50, constant + 100)])
+        given = Ridge.of(beside, targets).predict(other, [1e-6])[0]
+        np.testing.assert_allclose(given, wanted, rtol=1e-9)
+
+
 def test_constant_facts_and_cells_are_left_out_and_named() -> None:
     mine = FACTS["mine"].copy()
     mine[:, :, 0] = True

@@ -142,6 +142,19 @@ def test_noise_has_the_asked_strength_its_draw_is_shared_and_clipping_keeps_the_
     assert clipped.min() == 0 and clipped.max() == 255
 
 
+def test_pixels_that_are_outside_of_the_range_are_not_clipped_to_it() -> None:
+    """Before: frames of zero mean lost all that was below 0, noise or none, without a word."""
+    o = torch.linspace(-1.0, 1.0, 48).reshape(1, 4, 4, 3)
+    hit = np.array([0])
+    with pytest.raises(
+        ValueError, match="clip=True keeps pixels in 0 to 1, got frames from -1 to 1"
+    ):
+        disturbed_frames(o, hit, np.array([0.0]), True, seed=0, white=1.0)
+    torch.testing.assert_close(disturbed_frames(o, hit, np.array([0.0]), False, 0, 1.0), o)
+    inside = disturbed_frames((o + 1) / 2, hit, np.array([0.0]), True, 0, 1.0)
+    torch.testing.assert_close(inside, (o + 1) / 2)
+
+
 def test_a_shuffle_moves_the_named_frames_only_and_always_moves_some() -> None:
     for seed in range(30):
         order = shuffle_order(12, 1, 3, np.random.default_rng(seed))

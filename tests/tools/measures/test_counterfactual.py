@@ -1,6 +1,7 @@
 """Counterfactual recall against agents of which it is known what their decisions rest on."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -107,6 +108,21 @@ def test_donors_that_hold_the_same_cue_change_nothing_and_are_told_apart() -> No
     assert found.profile(differing=True)[-1] == 1 == found.memory_reliance(differing=True).value
     assert np.isnan(found.profile(differing=True)[:-1]).all()  # later frames are all alike
     assert found.memory_reliance().low < differs.mean() < found.memory_reliance().high
+
+
+def test_donors_whose_states_alone_differ_are_told_apart_too() -> None:
+    """Before: of episodes longer than the cap the last frames are kept; where these were alike, the
+    donors whose states had seen another cue were left out.
+    """
+    nothing = replace(window(3, starts=()), frames=torch.zeros(3, 4, 4, 3, dtype=torch.uint8))
+    windows = []
+    for cue in ([9.0, 0.0], [9.0, 0.0], [0.0, 9.0]):
+        windows.append(replace(nothing, state=torch.tensor([[*cue, 5.0]]), first=5))
+    found = counterfactual_of_windows(cue_policy(2), windows, donors=2)
+    assert np.sort(found.memory_flip).tolist() == [[0, 1], [0, 1], [1, 1]]
+    np.testing.assert_array_equal(found.memory_differs, found.memory_flip)
+    assert found.memory_reliance().value == pytest.approx(2 / 3)
+    assert found.memory_reliance(differing=True).value == 1
 
 
 def test_two_of_three_frames_that_hold_one_fact_hide_each_other_and_a_block_shows_them() -> None:

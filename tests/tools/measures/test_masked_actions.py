@@ -245,3 +245,39 @@ def test_a_noisy_frame_that_gives_no_numbers_is_refused(feedback: bool) -> None:
         contamination(
             policy, ToyEnv([14]), sigmas=(30.0,), delays=(0,), starts=1, feedback=feedback
         )
+
+
+@pytest.mark.parametrize("kind", TARGETS)
+def test_outputs_that_tie_and_stay_as_they_are_have_not_changed(kind: str) -> None:
+    """Before: nothing divided by nothing, and the control without memory was NaN in place of 0.
+
+    Two actions are alike always; they differ where a frame is noisy (its numbers are not whole).
+    """
+
+    def remember(features: Tensor, *rest: Any) -> tuple[Tensor, Any]:
+        noisy = (features - features.round()).abs()
+        alike = torch.zeros_like(noisy)
+        never = torch.full_like(noisy, -torch.inf)
+        return torch.cat([alike, noisy, never], -1), None
+
+    read = _probabilities if kind == "probs" else read_plain
+    policy = Policy(
+        lambda o: o.to(torch.float64).flatten(1)[:, :1],
+        remember,
+        read=read,
+        offers=("q",) if kind == "q" else ("logits", "probs"),
+    )
+    target: Any = kind
+    noise = contamination(
+        policy, ToyEnv([6, 8]), sigmas=(1.0,), delays=(0, 1, 2), starts=8, target=target
+    )
+    assert np.isnan(noise.change[:, 0, 0]).all()  # it changed, and there is no spread to measure by
+    assert noise.mean("change")[0, 1:].tolist() == [0, 0]
+    exchanged = counterfactual(policy, ToyEnv([6] * 4), episodes=4, donors=2, target=target)
+    for effect in ("flip", "distance", "change"):
+        assert exchanged.profile(effect).tolist() == [0] * 6  # type: ignore[arg-type]
+        assert exchanged.memory_reliance(effect).value == 0  # type: ignore[arg-type]
+
+
+def _probabilities(out: Tensor, output: str) -> Tensor:
+    return out.softmax(-1) if output == "probs" else out

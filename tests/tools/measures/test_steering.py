@@ -135,6 +135,32 @@ def test_a_direction_is_the_difference_between_the_means_of_classes() -> None:
     assert not moves[2:].any()
 
 
+def test_a_class_that_no_episode_had_at_a_step_has_no_direction_there() -> None:
+    """Before: such a state was moved to the middle of all others, and counted."""
+    values = np.random.default_rng(1).integers(0, 3, (200, 2))
+    values[:, 1] %= 2
+    found, _ = directions(values)
+    given = np.array([0, 2, 1, 0])
+    donors = np.array([1, 0, 3, 2])
+    assert found.moves("a", 0, given, donors)[1].all()
+    moves, is_other = found.moves("a", 1, given, donors)
+    assert is_other.tolist() == [False, False, True, True] and not moves[:2].any()
+    np.testing.assert_allclose(moves[2:, 0], [-3, 3], atol=1e-6)
+    never = np.array([0, 3, 1, 0])
+    assert found.moves("a", 0, never, donors)[1].tolist() == [False, False, True, True]
+
+
+def test_a_number_that_was_the_same_in_all_episodes_at_a_step_has_no_direction_there() -> None:
+    values = np.random.default_rng(1).normal(size=(200, 2))
+    values[:, 1] = 0.1
+    found, _ = directions(values)
+    given = np.array([0.1, 0.5])
+    swapped = np.array([1, 0])
+    assert found.moves("a", 0, given, swapped)[1].all()
+    moves, is_other = found.moves("a", 1, given, swapped)
+    assert not is_other.any() and not moves.any()
+
+
 def test_a_random_move_is_as_long_and_leaves_what_never_varies() -> None:
     values = np.random.default_rng(1).normal(size=(200, 2)).astype(np.float32)
     found, _ = directions(values)

@@ -38,8 +38,9 @@ class Ridge:
         inputs = np.asarray(inputs, np.float64)
         count, width = inputs.shape
         mean = inputs.mean(axis=0)
-        deviation = inputs.std(axis=0)
-        scale = np.where(deviation > 0, deviation, 1.0)
+        # not by the deviation: the mean of equal numbers is rounded, and may be another number
+        varies = inputs.min(axis=0) < inputs.max(axis=0)
+        scale = np.where(varies, inputs.std(axis=0), 1.0)
         scaled = (inputs - mean) / scale
         offset = targets.mean(axis=0)
         if is_dual is None:

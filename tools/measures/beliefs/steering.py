@@ -177,7 +177,8 @@ class Directions:
 
     def slopes(self, name: str, step: int) -> Array | None:
         """By how much the state [D] at a step changes with each target number [M] of a fact, float
-        [M, D]; None where too few episodes tell.
+        [M, D], NaN for those that are the same in all episodes at this step; None where too few
+        episodes tell.
         """
         if step >= self.states.shape[1]:
             return None
@@ -186,18 +187,21 @@ class Directions:
         if rows.sum() < MIN_FITTED:
             return None
         numbers = self.targets[name].numbers(values[rows])
+        varies = numbers.min(axis=0) < numbers.max(axis=0)
         numbers -= numbers.mean(axis=0)
         if rows.sum() < 2 * np.linalg.matrix_rank(numbers):
             return None
         states = self.states[rows, step].astype(np.float64)
         states -= states.mean(axis=0)
-        return np.asarray(np.linalg.pinv(numbers) @ states)
+        slopes = np.full((len(varies), states.shape[1]), np.nan)
+        slopes[varies] = np.linalg.pinv(numbers[:, varies]) @ states
+        return slopes
 
     def moves(
         self, name: str, step: int, values: NDArray[Any], donors: Ints
     ) -> tuple[Floats, NDArray[np.bool_]]:
         """How far the states [N, D] of a step move for their facts [N, ...] to become those of the
-        donors, and for whom: where both have a value, and not the same.
+        donors, and for whom: where both have a value, not the same, and the way is known.
         """
         flat = flat_fact(values, 1)
         slopes = self.slopes(name, step)
@@ -209,7 +213,13 @@ class Directions:
         rows = np.flatnonzero(is_other)
         targets = self.targets[name]
         change = targets.numbers(flat[donors[rows]]) - targets.numbers(flat[rows])
-        moves[rows] = change @ slopes
+        # not to or from a class that no episode had, at this step or at any
+        has_no_slope = np.isnan(slopes).any(axis=1)
+        is_class_known = (targets.decided(targets.numbers(flat)) == flat).all(axis=-1)
+        is_known = ~change[:, has_no_slope].any(axis=1)
+        is_known &= is_class_known[rows] & is_class_known[donors[rows]]
+        moves[rows[is_known]] = change[is_known] @ np.nan_to_num(slopes)
+        is_other[rows] = is_known
         return moves, is_other
 
     def at_random(self, moves: Floats, step: int, rng: np.random.Generator) -> Floats:

@@ -27,7 +27,7 @@ from torch import Tensor
 from arcade_torch.tools.measures import arguments, masked
 from arcade_torch.tools.measures.bootstrap import Array
 from arcade_torch.tools.measures.envs import one_hot
-from arcade_torch.tools.measures.frames import float_type, pictures, white_of
+from arcade_torch.tools.measures.frames import check_range, float_type, pictures, white_of
 from arcade_torch.tools.measures.keys import Names
 from arcade_torch.tools.measures.policy import (
     Policy,
@@ -314,6 +314,8 @@ def _compare(model: Any, target: str, raw: Tensor, decisions: Ints) -> Changes:
     a, b = masked.centred(before, after)
     spread = masked.span(a)
     change = torch.where(spread > 0, (b - a).abs().nan_to_num(0.0).amax(-1) / spread, torch.nan)
+    # where all actions tie there is no spread to measure by, and what stays the same is no change
+    change = torch.where((before == after).all(-1), 0.0, change)
 
     def where_reached(values: Tensor) -> Array:
         return np.asarray(torch.where(reached, values, torch.nan).numpy())
@@ -405,6 +407,8 @@ def disturbed_frames(
     noise = torch.randn(chosen.shape, generator=generator, dtype=torch.float32, device="cpu")
     scale = torch.from_numpy(white * sigmas).to(chosen).reshape(-1, *[1] * (frames.ndim - 1))
     noisy = (chosen[:, None] + scale * noise.to(chosen)[:, None]).flatten(0, 1)
+    if clip:
+        check_range(chosen, white)
     return noisy.clamp(0.0, white) if clip else noisy
 
 

@@ -414,6 +414,11 @@ class Exchange:
         distance = (distribution - clean_distribution).abs().sum(-1) / 2
         best = before[0].topk(2).values
         change = (after[:, action] - before[0, action]).abs() / (best[0] - best[1])
+        # where the best actions tie there is no gap to measure by, and what stays the same has not
+        # changed
+        is_same = (after == before).all(-1)
+        distance = torch.where(is_same, 0.0, distance)
+        change = torch.where(is_same, 0.0, change)
 
         def where_exchanged(values: Tensor) -> Array:
             finite = values.isfinite().numpy() & np.isfinite(differs)
@@ -459,9 +464,15 @@ class Exchange:
 
 
 def _same_past(track: Track, mixed: Track) -> bool:
-    """Whether two episodes saw and did the same before their last frame."""
+    """Whether two episodes saw and did the same before their last frame, from the same state on."""
     same_frames = np.array_equal(track.frame_ids[:-1], mixed.frame_ids[:-1])
-    return same_frames and torch.equal(track.last_action[:-1], mixed.last_action[:-1])
+    same_actions = torch.equal(track.last_action[:-1], mixed.last_action[:-1])
+    return same_frames and same_actions and _same_state(track.state, mixed.state)
+
+
+def _same_state(state: Any, other: Any) -> bool:
+    """Whether two states, tensors or TensorDicts, hold the same numbers; two that are None do."""
+    return state is other or bool((state == other).all())
 
 
 def _padded(arrays: Sequence[Array], lags: int) -> Array:

@@ -147,7 +147,10 @@ class GapBias:
         """A number of the table, such as ``gap``, of one agent minus another's, its interval from
         the same draws.
         """
-        has_interval = min(self.row(first).seeds, self.row(second).seeds) > 1
+        rows = [self.row(first), self.row(second)]
+        has_interval = min(row.seeds for row in rows) > 1
+        if name == "bias" and self.baselines[first] != self.baselines[second]:
+            has_interval = all(row.bias.exists for row in rows)
         values = self._values[first][name] - self._values[second][name]
         return percentile_interval(values[0], values[1:], self.confidence, has_interval)
 
