@@ -227,11 +227,11 @@ def _resolve_one(id: str) -> str:
         )
     names = {alias.lower(): alias for alias in _ALIASES}
     near = difflib.get_close_matches(name.lower(), list(names), n=1, cutoff=0.4)
-    hint = f"did you mean {names[near[0]]!r}? " if near else ""
+    hint = f"did you mean {names[near[0]]!r}? Else " if near else ""
     raise ValueError(
-        f"unknown env id {format_value(id)}: {hint}All ids: arcade_torch.registered_ids() or "
-        "'arcade-torch list'; a game of your own has to be registered first, on the command line "
-        "with --import"
+        f"unknown env id {format_value(id)}: {hint}arcade_torch.registered_ids() lists all, as "
+        "does 'arcade-torch list'; a game of your own has to be registered first, on the command "
+        "line with --import"
     )
 
 

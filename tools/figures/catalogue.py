@@ -181,7 +181,7 @@ def _check_paper(options: PaperOptions) -> None:
         if option.name not in of_all and value != option.default:
             raise ValueError(
                 "--paper draws published numbers as they are: leave out "
-                f"--{option.name}, got {value}"
+                f"--{option.name.replace('_', '-')}, got {value}"
             )
 
 
