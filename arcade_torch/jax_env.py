@@ -114,9 +114,13 @@ class JaxEnv(BaseEnv):
         """Copy everything that determines the future.
 
         Returns:
-            TensorDict [N] of plain tensors: keys, the env's state, observation, counts.
+            TensorDict [N] of plain tensors: keys, the env's state, observation, counts, and
+            ``ends``, bool [N, 2]: episodes that have terminated or been truncated stay so, until
+            they are reset.
         """
-        return self._snapshots.export(self._live)
+        state = self._snapshots.export(self._live)
+        state["ends"] = self._ended()
+        return state
 
     def set_state(self, state: TensorDictBase) -> TensorDict:
         """Go on from what ``get_state`` gave.
@@ -128,20 +132,17 @@ class JaxEnv(BaseEnv):
             ValueError: The state of another env or batch size.
             TypeError: No tensordict.
         """
-        self._go_on(self._snapshots.load(state))
+        self._go_on_from(state)
         return self._root()
 
     def get_extra_state(self) -> dict[str, Any]:
         """The env's part of ``state_dict``: its state, and which episodes have ended."""
-        return {**self.get_state().to_dict(), "ends": self._ended()}
+        saved: dict[str, Any] = self.get_state().to_dict()
+        return saved
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Load the env's part of a ``state_dict``."""
-        saved = validation.saved_state(state, self.num_envs, self.device)
-        ends = saved.get("ends", None)
-        self._go_on(
-            self._snapshots.load(saved), ends.clone() if ends is not None and ends.any() else None
-        )
+        self._go_on_from(validation.saved_state(state, self.num_envs, self.device))
 
     # What an ArcadeCollector needs beside TorchRL's methods.
 
@@ -303,6 +304,21 @@ class JaxEnv(BaseEnv):
         """
         # ``nn.Module`` sets attributes slowly, and one by one
         self.__dict__.update(_live=live, _ends=ends, _count=self._count + 1)
+
+    def _go_on_from(self, state: TensorDictBase) -> None:
+        """Put a snapshot in place; those of version 0.2.0 say of no episode that it has ended."""
+        live = self._snapshots.load(state)
+        ends = state.get("ends", None)
+        if ends is None:
+            self._go_on(live)
+            return
+        validation.check_tensor(ends, "state entry 'ends'")
+        if ends.dtype is not torch.bool or ends.shape != (self.num_envs, 2):
+            raise ValueError(
+                f"state entry 'ends' is {ends.dtype} {list(ends.shape)}, expected torch.bool "
+                f"[{self.num_envs}, 2]"
+            )
+        self._go_on(live, ends.to(self.device, copy=True) if ends.any() else None)
 
     def _ended(self) -> torch.Tensor:
         """bool [N, 2], where episodes have terminated or been truncated and wait for a reset."""
