@@ -70,8 +70,7 @@ class PolicyRunner:
         self._varies = False
         # what the policy wrote to the root at the last step
         self._left: dict[NestedKey, torch.Tensor] = {}
-        # a graph, which is no module, takes the same entries at every step
-        self._shows_left = isinstance(policy, nn.Module) or not hasattr(policy, "module")
+        self._shows_left = not _takes_one_layout(policy)
 
     def initial_state(self) -> TensorDict:
         """Values of the policy's primers, TensorDict [N]; what the policy wrote is forgotten.
@@ -274,6 +273,14 @@ def _module_of(policy: Any) -> nn.Module:
     return module if isinstance(module, nn.Module) else nn.Module()
 
 
+def _takes_one_layout(policy: Any) -> bool:
+    """Whether a policy is a CUDA graph, which takes the same entries at every step: one of ours, or
+    ``CudaGraphModule``.
+    """
+    is_graph_module = hasattr(policy, "module") and not isinstance(policy, nn.Module)
+    return is_graph_module or getattr(policy, "takes_one_layout", False)
+
+
 def _primers(policy: Any) -> list[TensorDictPrimer]:
     """The primers of all modules inside a policy."""
     primers = get_primers_from_module(_module_of(policy), warn=False)
@@ -286,9 +293,9 @@ def _begin_themselves(policy: Any) -> set[NestedKey]:
     """The states of the modules that read ``is_init``, where they begin anew."""
     keys = set[NestedKey]()
     for module in _module_of(policy).modules():
-        owns_states = hasattr(module, "make_tensordict_primer")
-        if owns_states and "is_init" in getattr(module, "in_keys", ()):
-            keys.update(module.make_tensordict_primer().primers.keys(True, True))
+        make_primer: Any = getattr(module, "make_tensordict_primer", None)
+        if make_primer is not None and "is_init" in getattr(module, "in_keys", ()):
+            keys.update(make_primer().primers.keys(True, True))
     return keys
 
 
@@ -313,7 +320,7 @@ def _values(
             drawn = spec.rand() if spec.shape == shape else spec.expand(shape).rand()
             yield key, drawn.to(device)
             continue
-        value = given[key]
+        value: Any = given[key]
         value = value() if callable(value) else value
         zeros = torch.zeros(shape, dtype=spec.dtype, device=device)
         yield key, zeros + torch.as_tensor(value, dtype=spec.dtype, device=device)
