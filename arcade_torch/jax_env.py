@@ -115,8 +115,7 @@ class JaxEnv(BaseEnv):
 
         Returns:
             TensorDict [N] of plain tensors: keys, the env's state, observation, counts, and
-            ``ends``, bool [N, 2]: episodes that have terminated or been truncated stay so, until
-            they are reset.
+            ``ends`` bool [N, 2], which episodes have terminated or been truncated.
         """
         state = self._snapshots.export(self._live)
         state["ends"] = self._ended()
@@ -137,8 +136,7 @@ class JaxEnv(BaseEnv):
 
     def get_extra_state(self) -> dict[str, Any]:
         """The env's part of ``state_dict``: its state, and which episodes have ended."""
-        saved: dict[str, Any] = self.get_state().to_dict()
-        return saved
+        return dict(self.get_state().to_dict())
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Load the env's part of a ``state_dict``."""
@@ -242,7 +240,11 @@ class JaxEnv(BaseEnv):
         if ends is not None:
             ends = ends & ~torch.from_numpy(rows).to(self.device).unsqueeze(-1)
         self._go_on(self._batched.begin_anew(self._live, rows), ends)
-        return self._root()
+        if tensordict is None or rows.all():
+            return self._root()
+        root = self.observe()
+        validation.fill_up(tensordict, root)
+        return root
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = validation.tensor(tensordict, "action")
@@ -254,6 +256,8 @@ class JaxEnv(BaseEnv):
         if "_step" in tensordict:
             marked = validation.mask(tensordict, "_step", self.num_envs)
             validation.check_merge(tensordict, following)
+            if validation.lacks_entries(tensordict, following):
+                validation.fill_up(tensordict, self.observe())
             rows = jax.device_put(marked.cpu().numpy(), self._jax_device)
             after = choose_rows(rows, after, self._live)
             following = validation.only_marked(tensordict, following, marked)
@@ -306,19 +310,9 @@ class JaxEnv(BaseEnv):
         self.__dict__.update(_live=live, _ends=ends, _count=self._count + 1)
 
     def _go_on_from(self, state: TensorDictBase) -> None:
-        """Put a snapshot in place; those of version 0.2.0 say of no episode that it has ended."""
+        """Put a snapshot in place."""
         live = self._snapshots.load(state)
-        ends = state.get("ends", None)
-        if ends is None:
-            self._go_on(live)
-            return
-        validation.check_tensor(ends, "state entry 'ends'")
-        if ends.dtype is not torch.bool or ends.shape != (self.num_envs, 2):
-            raise ValueError(
-                f"state entry 'ends' is {ends.dtype} {list(ends.shape)}, expected torch.bool "
-                f"[{self.num_envs}, 2]"
-            )
-        self._go_on(live, ends.to(self.device, copy=True) if ends.any() else None)
+        self._go_on(live, validation.saved_ends(state, self.num_envs, self.device))
 
     def _ended(self) -> torch.Tensor:
         """bool [N, 2], where episodes have terminated or been truncated and wait for a reset."""
