@@ -148,6 +148,9 @@ class GraphedPolicy(TensorDictModuleBase):
         make_recording: see :class:`GraphedFunction`.
     """
 
+    takes_one_layout = True
+    """For ``ArcadeCollector``: the same entries at every step, and none that the last one wrote."""
+
     def __init__(
         self,
         policy: TensorDictModuleBase,

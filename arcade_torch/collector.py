@@ -55,7 +55,8 @@ class ArcadeCollector(BaseCollector):
         policy: A TensorDict module or a callable that reads root keys and writes ``action``; None
             for random actions. Its recurrent state (primers of ``make_tensordict_primer``) is
             carried from ``("next", key)`` to ``key``. A module that reads ``is_init`` begins anew
-            by itself; for others the primers' values are put back.
+            by itself; for others the primers' values are put back. What it writes to the root is
+            there at its next step too.
         frames_per_batch: N * T.
         total_frames: Iteration ends after so many frames; -1 for never. ``collect`` does not look
             at it.
@@ -334,6 +335,7 @@ class ArcadeCollector(BaseCollector):
         action, extras, self._state = self._runner(obs, self._state)
         if random or action is None:
             action = random_actions(self.env.action_spec, self._generator)
+            self._runner.show_action(action)
         store_action = functools.partial(buffer.write_action, step, obs, action)
         into = buffer.place(step + 1) if self._draws_in_place else None
         raw = self.env.step_raw(action, while_computing=store_action, into=into)
@@ -442,6 +444,7 @@ class ArcadeCollector(BaseCollector):
         if self._obs is None or self._buffer is None:
             return out
         out["recurrent_state"] = self._state.clone().to_dict()
+        out["left"] = self._runner.left_state()
         out["window_starts"] = [state.clone().to_dict() for state in self._window_starts]
         out["overlap"] = self._buffer.overlap_state()
         return out
@@ -520,6 +523,7 @@ class ArcadeCollector(BaseCollector):
         # last, for an overlap that was refused is none to go on with
         self._acted = acted
         self._state = state
+        self._runner.load_left_state(state_dict.get("left", {}))
         self._window_starts.extend(starts)
 
     def _as_state(self, state: dict[str, Any], initial: TensorDict) -> TensorDict:

@@ -416,6 +416,7 @@ class ArcadeEnv(BaseEnv):
         root = self._root(batch, ended, to_torch(pixels, self.device))
         if tensordict is not None and not rows.all():
             validation.check_merge(tensordict, root)
+            validation.fill_up(tensordict, root)
         self._go_on(batch, ended, self._live.ends)  # which counts in the rows that stay
         return root
 
@@ -452,6 +453,8 @@ class ArcadeEnv(BaseEnv):
         # where it stays if the next line refuses
         self._go_on(before.batch, before.ended, before.ends)
         validation.check_merge(tensordict, following)
+        if validation.lacks_entries(tensordict, following):
+            validation.fill_up(tensordict, self.observe())
         mask = jax.device_put(marked.cpu().numpy(), self._jax_device)
         padded = self._batched.pad(stepped.batch)
         padded_before = self._batched.pad(before.batch)

@@ -114,9 +114,12 @@ class JaxEnv(BaseEnv):
         """Copy everything that determines the future.
 
         Returns:
-            TensorDict [N] of plain tensors: keys, the env's state, observation, counts.
+            TensorDict [N] of plain tensors: keys, the env's state, observation, counts, and
+            ``ends`` bool [N, 2], which episodes have terminated or been truncated.
         """
-        return self._snapshots.export(self._live)
+        state = self._snapshots.export(self._live)
+        state["ends"] = self._ended()
+        return state
 
     def set_state(self, state: TensorDictBase) -> TensorDict:
         """Go on from what ``get_state`` gave.
@@ -128,20 +131,16 @@ class JaxEnv(BaseEnv):
             ValueError: The state of another env or batch size.
             TypeError: No tensordict.
         """
-        self._go_on(self._snapshots.load(state))
+        self._go_on_from(state)
         return self._root()
 
     def get_extra_state(self) -> dict[str, Any]:
         """The env's part of ``state_dict``: its state, and which episodes have ended."""
-        return {**self.get_state().to_dict(), "ends": self._ended()}
+        return dict(self.get_state().to_dict())
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Load the env's part of a ``state_dict``."""
-        saved = validation.saved_state(state, self.num_envs, self.device)
-        ends = saved.get("ends", None)
-        self._go_on(
-            self._snapshots.load(saved), ends.clone() if ends is not None and ends.any() else None
-        )
+        self._go_on_from(validation.saved_state(state, self.num_envs, self.device))
 
     # What an ArcadeCollector needs beside TorchRL's methods.
 
@@ -241,7 +240,11 @@ class JaxEnv(BaseEnv):
         if ends is not None:
             ends = ends & ~torch.from_numpy(rows).to(self.device).unsqueeze(-1)
         self._go_on(self._batched.begin_anew(self._live, rows), ends)
-        return self._root()
+        if tensordict is None or rows.all():
+            return self._root()
+        root = self.observe()
+        validation.fill_up(tensordict, root)
+        return root
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = validation.tensor(tensordict, "action")
@@ -253,6 +256,8 @@ class JaxEnv(BaseEnv):
         if "_step" in tensordict:
             marked = validation.mask(tensordict, "_step", self.num_envs)
             validation.check_merge(tensordict, following)
+            if validation.lacks_entries(tensordict, following):
+                validation.fill_up(tensordict, self.observe())
             rows = jax.device_put(marked.cpu().numpy(), self._jax_device)
             after = choose_rows(rows, after, self._live)
             following = validation.only_marked(tensordict, following, marked)
@@ -303,6 +308,11 @@ class JaxEnv(BaseEnv):
         """
         # ``nn.Module`` sets attributes slowly, and one by one
         self.__dict__.update(_live=live, _ends=ends, _count=self._count + 1)
+
+    def _go_on_from(self, state: TensorDictBase) -> None:
+        """Put a snapshot in place."""
+        live = self._snapshots.load(state)
+        self._go_on(live, validation.saved_ends(state, self.num_envs, self.device))
 
     def _ended(self) -> torch.Tensor:
         """bool [N, 2], where episodes have terminated or been truncated and wait for a reset."""

@@ -2,7 +2,7 @@
 stored of it.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any, NoReturn
 
 import torch
@@ -23,6 +23,8 @@ ENDS = ("done", "terminated", "truncated")
 
 class PolicyRunner:
     """Runs a policy, and carries what it writes under ``"next"`` to the root of the following step.
+    What it writes to the root is there at the following step too, as in TorchRL's collectors: noise
+    that goes on from step to step, plans of several actions.
 
     Args:
         policy: Reads root keys, writes ``action`` and, if recurrent, ``("next", <state key>)``;
@@ -61,28 +63,26 @@ class PolicyRunner:
         self._known = {path_of(key)[0] for key in root_keys} | {"action", *ENDS}
         # what the env writes under "next", whatever a policy has written there
         self._outcomes = {path_of(key) for key in (*root_keys, "reward", *ENDS)}
-        # A module that reads is_init begins anew by itself. Stored states show what it begins with.
-        self._sets_initial = store_states or "is_init" not in reads
+        # states of modules that begin anew by themselves
+        self._begin_themselves: set[NestedKey] = set()
         self._initial = TensorDict({}, batch_size=self._size, device=device)
+        # whether the primers give other values for every episode
+        self._varies = False
+        # what the policy wrote to the root at the last step
+        self._left: dict[NestedKey, torch.Tensor] = {}
+        self._shows_left = not _takes_one_layout(policy)
 
     def initial_state(self) -> TensorDict:
-        """Values of the policy's primers, TensorDict [N].
+        """Values of the policy's primers, TensorDict [N]; what the policy wrote is forgotten.
 
         Raises:
             KeyError: The policy carries an entry from step to step for which it has no primer.
         """
-        state = TensorDict({}, batch_size=self._size, device=self._device)
-        for primer in _primers(self._policy):
-            for key, spec in primer.primers.items(True, True):
-                default = (
-                    primer.default_value.get(key, 0.0)
-                    if hasattr(primer.default_value, "get")
-                    else 0.0
-                )
-                shape = spec.shape[len(primer.primers.shape) :]
-                value = default() if callable(default) else default
-                zeros = torch.zeros((*self._size, *shape), dtype=spec.dtype, device=self._device)
-                state[key] = zeros + torch.as_tensor(value, dtype=spec.dtype, device=self._device)
+        self._left = {}
+        self._varies = any(map(_varies, _primers(self._policy)))
+        if not self._store_states:  # stored ones show what a module begins with
+            self._begin_themselves = _begin_themselves(self._policy)
+        state = self._first_values()
         written = [unravel_key(key) for key in getattr(self._policy, "out_keys", [])]
         for key in getattr(self._policy, "in_keys", []):
             is_carried = (
@@ -96,13 +96,23 @@ class PolicyRunner:
         self._initial = state
         return state.clone()
 
-    def begin_anew(self, state: TensorDict, is_init: torch.Tensor) -> TensorDict:
-        """The state with the primers' values where ``is_init`` (bool [N, 1]) is true; a new
-        TensorDict.
+    def _first_values(self) -> TensorDict:
+        """The state that episodes begin with, TensorDict [N]."""
+        state = TensorDict({}, batch_size=self._size, device=self._device)
+        for primer in _primers(self._policy):
+            for key, value in _values(primer, self._size, self._device):
+                state[key] = value
+        return state
+
+    def begin_anew(
+        self, state: TensorDict, is_init: torch.Tensor, but: Collection[NestedKey] = ()
+    ) -> TensorDict:
+        """The state with the primers' values where ``is_init`` (bool [N, 1]) is true, ``but`` for
+        the entries that stay; a new TensorDict.
         """
         out = TensorDict({}, batch_size=self._size, device=self._device)
         for key, value in state.items(True, True):
-            first = self._initial.get(key, None)
+            first = None if key in but else self._initial.get(key, None)
             mask = is_init.reshape(-1, *(1,) * (value.ndim - 1))
             out[key] = value if first is None else torch.where(mask, first, value)
         return out
@@ -118,17 +128,21 @@ class PolicyRunner:
         """
         if self._policy is None:
             return None, {}, state
-        if self._sets_initial and len(state.keys()):
-            state = self.begin_anew(state, obs["is_init"])
+        if set(state.keys(True, True)) - self._begin_themselves:
+            state = self.begin_anew(state, obs["is_init"], self._begin_themselves)
         # the same at every step: graphs hold one layout
         entries = {key: obs[key] for key in self.reads if key in obs} | self._ends
-        td = TensorDict(entries | dict(state.items()), batch_size=self._size, device=self._device)
+        entries = self._left | entries | dict(state.items())
+        td = TensorDict(entries, batch_size=self._size, device=self._device)
         td = self._policy(td)
         if not isinstance(td, TensorDictBase) or "action" not in td:
             _refuse_output(td)
         carried = TensorDict({}, batch_size=self._size, device=self._device)
         stored: dict[NestedKey, torch.Tensor] = {}
         states = set(map(path_of, state.keys(True, True)))
+        left: dict[NestedKey, torch.Tensor] = {}
+        for key, value in state.items(True, True):
+            carried[key] = td.get(key, value)  # unless the policy writes another for the next step
         for key, value in td.items(True, True):
             path = path_of(key)
             if path[0] == "next" and path[1:] in self._outcomes:
@@ -136,15 +150,39 @@ class PolicyRunner:
             if path[0] == "next":
                 carried[path[1:]] = value
             is_state = path[0] == "next" or path in states
+            if not is_state and (path[0] not in self._known or path == ("action",)):
+                left[key] = value
             if path[0] not in self._known and self._keeps(path, is_state):
                 stored[key] = value
+        self._left = left if self._shows_left else {}
+        if self._varies and obs["is_init"].any():
+            self._initial = self._first_values()
         return td["action"], stored, carried
 
+    def show_action(self, action: torch.Tensor) -> None:
+        """Put the action that was taken in the place of the policy's."""
+        if "action" in self._left:
+            self._left["action"] = action
+
+    def left_state(self) -> dict[str, Any]:
+        """What the policy wrote to the root at the last step, as plain tensors."""
+        left: dict[str, Any] = TensorDict(self._left, batch_size=self._size).clone().to_dict()
+        return left
+
+    def load_left_state(self, state: dict[str, Any]) -> None:
+        """Load what ``left_state`` gave."""
+        left = TensorDict(state, batch_size=self._size, device=self._device)
+        self._left = dict(left.items(True, True))
+
     def _keeps(self, path: tuple[str, ...], is_state: bool) -> bool:
-        """Whether an entry is stored."""
+        """Whether an entry is stored: private ones if they are asked for, as in TorchRL's
+        collectors.
+        """
         if is_state and not self._store_states:
             return False
-        return self._store is None or _is_below(path, self._store)
+        if self._store is None:
+            return is_state or not any(name.startswith("_") for name in path)
+        return _is_below(path, self._store)
 
 
 def _refuse_output(given: Any) -> NoReturn:
@@ -227,14 +265,62 @@ def path_of(key: NestedKey) -> tuple[str, ...]:
     return (key,) if isinstance(key, str) else key
 
 
-def _primers(policy: Any) -> list[TensorDictPrimer]:
-    """The primers of all modules inside a policy; ``CudaGraphModule`` is no module itself, but
-    holds one.
+def _module_of(policy: Any) -> nn.Module:
+    """The module that a policy is; ``CudaGraphModule`` is none itself, but holds one. An empty one
+    of a function.
     """
     module = policy if isinstance(policy, nn.Module) else getattr(policy, "module", None)
-    if not isinstance(module, nn.Module):
-        return []
-    primers = get_primers_from_module(module, warn=False)
+    return module if isinstance(module, nn.Module) else nn.Module()
+
+
+def _takes_one_layout(policy: Any) -> bool:
+    """Whether a policy is a CUDA graph, which takes the same entries at every step: one of ours, or
+    ``CudaGraphModule``.
+    """
+    is_graph_module = hasattr(policy, "module") and not isinstance(policy, nn.Module)
+    return is_graph_module or getattr(policy, "takes_one_layout", False)
+
+
+def _primers(policy: Any) -> list[TensorDictPrimer]:
+    """The primers of all modules inside a policy."""
+    primers = get_primers_from_module(_module_of(policy), warn=False)
     if primers is None:
         return []
     return [primers] if isinstance(primers, TensorDictPrimer) else list(primers)
+
+
+def _begin_themselves(policy: Any) -> set[NestedKey]:
+    """The states of the modules that read ``is_init``, where they begin anew."""
+    keys = set[NestedKey]()
+    for module in _module_of(policy).modules():
+        make_primer: Any = getattr(module, "make_tensordict_primer", None)
+        if make_primer is not None and "is_init" in getattr(module, "in_keys", ()):
+            keys.update(make_primer().primers.keys(True, True))
+    return keys
+
+
+def _varies(primer: TensorDictPrimer) -> bool:
+    """Whether a primer gives other values for every episode."""
+    given = primer.default_value
+    if primer.random or callable(given):
+        return True
+    return any(callable(given[key]) for key in primer.primers.keys(True, True))
+
+
+def _values(
+    primer: TensorDictPrimer, size: list[int], device: torch.device
+) -> Iterator[tuple[NestedKey, torch.Tensor]]:
+    """What a primer puts at the beginning of an episode: keys and values [N, ...]."""
+    given = primer.default_value
+    if callable(given):
+        given = given(reset=torch.ones(size, dtype=torch.bool, device=device))
+    for key, spec in primer.primers.items(True, True):
+        shape = (*size, *spec.shape[len(primer.primers.shape) :])
+        if primer.random:
+            drawn = spec.rand() if spec.shape == shape else spec.expand(shape).rand()
+            yield key, drawn.to(device)
+            continue
+        value: Any = given[key]
+        value = value() if callable(value) else value
+        zeros = torch.zeros(shape, dtype=spec.dtype, device=device)
+        yield key, zeros + torch.as_tensor(value, dtype=spec.dtype, device=device)

@@ -512,7 +512,7 @@ def _write(target: torch.Tensor, index: Any, values: torch.Tensor) -> None:
     """Write values (no gradient) to a place; on the CPU through numpy, at a sixth of a tensor's
     price or less.
     """
-    if is_host(target.device):
+    if is_host(target.device) and target.dtype is not torch.bfloat16:  # which NumPy lacks
         target.numpy()[index] = values.numpy()
     else:
         target[upload(index, target.device) if isinstance(index, np.ndarray) else index] = values

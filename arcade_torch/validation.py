@@ -151,6 +151,20 @@ def check_merge(td: TensorDictBase, root: TensorDictBase) -> None:
             )
 
 
+def lacks_entries(td: TensorDictBase, following: TensorDictBase) -> bool:
+    """Whether a root lacks something that ``"next"`` has, beside the reward."""
+    return bool(set(following.keys()) - set(td.keys()) - {"reward"})
+
+
+def fill_up(td: TensorDictBase, root: TensorDictBase) -> None:
+    """Add the entries that ``td`` lacks, before TorchRL merges it with ``root``, the live episodes:
+    it would put zeros in their place.
+    """
+    for key in root.keys(True, True):
+        if td.get(key, None) is None:
+            td.set(key, root[key])
+
+
 def keep_what_was_written(td: TensorDictBase, following: TensorDictBase) -> None:
     """Add what the policy wrote for the next step, such as its recurrent state, to the ``"next"``
     that the env gives; say so if it ends there, since no spec of the env names it.
@@ -173,6 +187,25 @@ def saved_state(state: Mapping[str, Any], num_envs: int, device: torch.device | 
                 f"the saved entry {name!r} is of {len(value)} envs, this env has {num_envs}"
             )
     return TensorDict(dict(state), batch_size=[num_envs], device=device)
+
+
+def saved_ends(
+    state: TensorDictBase, num_envs: int, device: torch.device | None
+) -> torch.Tensor | None:
+    """Which episodes of a snapshot have ended, bool [num_envs, 2], a copy; None: none of them, nor
+    of the snapshots of version 0.2.0. Raises ValueError if the entry is something else.
+    """
+    ends = state.get("ends", None)
+    if ends is None:
+        return None
+    check_tensor(ends, "state entry 'ends'")
+    if ends.dtype is not torch.bool or ends.shape != (num_envs, 2):
+        raise ValueError(
+            f"state entry 'ends' is {ends.dtype} {list(ends.shape)}, expected torch.bool "
+            f"[{num_envs}, 2]"
+        )
+    copied: torch.Tensor = ends.to(device, copy=True)
+    return copied if copied.any() else None
 
 
 def only_marked(

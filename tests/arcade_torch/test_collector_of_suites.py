@@ -197,6 +197,21 @@ def test_last_actions_of_double_precision_are_what_the_env_got() -> None:
     assert not different(batch.exclude("collector"), rollout[:, 3:])
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_actions_of_half_precision_are_stored(dtype: torch.dtype) -> None:
+    spec = Bounded(-1, 1, shape=(N, 2), dtype=dtype)
+
+    def act(td: TensorDictBase) -> TensorDictBase:
+        wide = (td["step_count"] + td["last_action"]).float()
+        return td.set("action", torch.sin(wide).to(dtype))
+
+    env = from_jax(Plain(), num_envs=N, max_steps=6, action_spec=spec)
+    rollout = env.rollout(T, act, break_when_any_done=False)
+    batch = next(iter(ArcadeCollector(env, act, N * T, seed=0)))
+    assert batch["action"].dtype is dtype
+    assert not different(batch.exclude("collector"), rollout)
+
+
 class Cut(SixWalk):
     """Truncated after three steps, though its params name a limit of eight."""
 

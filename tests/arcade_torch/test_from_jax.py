@@ -242,6 +242,27 @@ def test_a_snapshot_determines_the_future(name: str) -> None:
         env.set_state(None)
 
 
+@pytest.mark.parametrize("of", ["state", "state_dict"])
+def test_a_snapshot_of_an_end_stays_at_the_end(of: str) -> None:
+    env = made("done")
+    td = env.reset()
+    while not td["done"].any():
+        td = env.step(env.rand_action(td))["next"].exclude("reward")
+    assert not td["done"].all()
+    another = made("done", seed=99)
+    if of == "state":
+        another.set_state(env.get_state())
+    else:
+        another.load_state_dict(env.state_dict())
+    action = env.rand_action(td)["action"]
+    expected = env.step(td.clone().set("action", action))["next"]
+    assert torch.equal(expected["done"], td["done"])
+    given = another.step(another.observe().set("action", action))["next"]
+    assert (given == expected).all()
+    with pytest.raises(ValueError, match="entry 'ends'"):
+        env.set_state(env.get_state().set("ends", torch.zeros(N, 2, dtype=torch.int64)))
+
+
 def test_observations_are_the_memory_of_jax_and_stay_as_they_are() -> None:
     env = made("plain")
     root = env.reset()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from torchrl.data import Binary, Bounded, Categorical, MultiCategorical, Unbounded
+from torchrl.envs import check_env_specs
 
 from arcade_torch import from_jax
 from arcade_torch.policies import random_actions
@@ -381,3 +382,27 @@ def test_integers_that_python_counts_without_effect_are_allowed() -> None:
 def test_whole_spaces_of_bounds_are_bounded() -> None:
     spec = from_jax(env_with(action_space=Box(-1, 1, (3,))), num_envs=N).action_spec
     assert isinstance(spec, Bounded) and spec.dtype is torch.float32
+
+
+class Bandit:
+    """Two arms, one step an episode, and nothing to remember."""
+
+    def __init__(self, state: Any) -> None:
+        self.state = state
+
+    def reset(self, key: jax.Array) -> Any:
+        return jax.random.uniform(key, (2,)), self.state
+
+    def step(self, key: jax.Array, state: Any, action: jax.Array) -> Any:
+        return jnp.zeros(2), state, action.astype(jnp.float32), True, {}
+
+
+@pytest.mark.parametrize("state", [None, (), {"nothing": None}], ids=str)
+def test_an_env_may_have_no_state(state: Any) -> None:
+    env = from_jax(Bandit(state), num_envs=N, action_spec=Categorical(2, shape=(N,)))
+    check_env_specs(env)
+    env.set_state(env.get_state())
+    steps = env.rollout(4, break_when_any_done=False)
+    assert torch.equal(steps["next", "reward"].squeeze(-1), steps["action"].float())
+    assert steps["is_init"].all()
+    assert steps["observation"].unique().numel() == 2 * 4 * N
