@@ -195,17 +195,19 @@ def make_optimizer(
     0.9, 0.999, no decay.
 
     On CUDA the step size, which :func:`set_learning_rate` moves, is a tensor that a graph can read.
+    Complex weights, which no fused kernel takes, are moved by torch's plain code.
 
     Source: Liu et al., "On the variance of the adaptive learning rate and beyond", arXiv
     1908.03265; Kingma & Ba, arXiv 1412.6980.
     """
     cuda = bool(parameters) and parameters[0].device.type == "cuda"
     lr = torch.tensor(learning_rate, device=parameters[0].device) if cuda else learning_rate
+    fused = not any(parameter.is_complex() for parameter in parameters)
     if kind == "adam":
-        return torch.optim.Adam(parameters, lr=lr, eps=1e-5, fused=True, capturable=cuda)
-    if not cuda:
+        return torch.optim.Adam(parameters, lr=lr, eps=1e-5, fused=fused, capturable=cuda)
+    if fused and not cuda:
         return FusedRAdam(parameters, lr=lr, fused=True)
-    return torch.optim.RAdam(parameters, lr=lr, foreach=True, capturable=True)
+    return torch.optim.RAdam(parameters, lr=lr, foreach=True, capturable=cuda)
 
 
 class FusedRAdam(torch.optim.Adam):

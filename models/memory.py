@@ -203,7 +203,7 @@ class Memory(nn.Module):
             raise ValueError(
                 f"x is {x.dtype} but the parameters are {dtype}: cast one of them with .to()"
             )
-        if torch.is_autocast_enabled(x.device.type):
+        if not x.is_meta and torch.is_autocast_enabled(x.device.type):  # meta knows no autocast
             raise ValueError(
                 "memory models round too much under autocast: turn it off here, as MemoryModule "
                 "does"

@@ -323,9 +323,9 @@ class MemoryNetwork(TensorDictModuleBase):
         """
         if self.num_actions:
             features = self._append(features, last_action, is_init)
-        device = features.device.type
-        if torch.is_autocast_enabled(device):  # a recurrence adds up what bfloat16 rounds away
-            with torch.autocast(device, enabled=False):
+        # a recurrence adds up what bfloat16 rounds away
+        if not features.is_meta and torch.is_autocast_enabled(features.device.type):
+            with torch.autocast(features.device.type, enabled=False):
                 y, state = self.block(features.float(), state, is_init)
         else:
             y, state = self.block(features, state, is_init)

@@ -6,6 +6,7 @@ import logging
 import multiprocessing
 import warnings
 from collections.abc import Sequence
+from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Literal
 
 import torch
@@ -147,10 +148,13 @@ class Recurrence:
             )
         x = x.reshape(*flat, x.shape[-1])
         is_init = is_init.reshape(flat)
-        if torch.is_autocast_enabled(x.device.type):
-            x = x.float()
+        in_full: AbstractContextManager[object] = nullcontext()
+        if not x.is_meta:  # it knows no autocast
+            in_full = torch.autocast(x.device.type, enabled=False)
+            if torch.is_autocast_enabled(x.device.type):
+                x = x.float()
 
-        with torch.autocast(x.device.type, enabled=False):
+        with in_full:
             if not recurrent:
                 state = self._stored_state(memory, tensordict, flat)
                 y, after = memory(x.unsqueeze(1), state, is_init.unsqueeze(1))

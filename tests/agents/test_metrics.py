@@ -1,6 +1,8 @@
 """The paper's score, episode bookkeeping, schedules, optimiser."""
 
+import functools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -217,3 +219,28 @@ def test_radam_in_one_pass_moves_a_weight_that_has_a_gradient_now_and_then_as_to
         plain.step()
         for a, b in zip(ours, theirs, strict=True):
             torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("kind", "plain"),
+    [("radam", torch.optim.RAdam), ("adam", functools.partial(torch.optim.Adam, eps=1e-5))],
+)
+def test_complex_weights_move_as_torch_moves_them(kind: Any, plain: Any) -> None:
+    """No fused kernel of torch takes them, and a memory may have them (``check_memory``)."""
+    generator = torch.Generator().manual_seed(0)
+    weights = [
+        torch.randn(3, 2, dtype=torch.complex64, generator=generator),
+        torch.randn(4, generator=generator),
+    ]
+    ours, theirs = ([nn.Parameter(x.clone()) for x in weights] for _ in range(2))
+    optimizer = make_optimizer(ours, 1e-2, kind)
+    reference = plain(theirs, lr=1e-2)
+    for _ in range(12):
+        for x, y in zip(ours, theirs, strict=True):
+            x.grad = torch.randn(x.shape, dtype=x.dtype, generator=generator)
+            y.grad = x.grad.clone()
+        optimizer.step()
+        reference.step()
+    for x, y, start in zip(ours, theirs, weights, strict=True):
+        assert (x - start).abs().min() > 1e-3
+        torch.testing.assert_close(x, y, rtol=1e-5, atol=1e-6)

@@ -3,9 +3,14 @@
 import dataclasses
 import json
 import random
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+from torch.nn import functional as F
 
 from arcade_torch.agents import (
     CheckpointError,
@@ -15,7 +20,9 @@ from arcade_torch.agents import (
     train,
 )
 from arcade_torch.agents.config import TrainConfig
+from arcade_torch.agents.policy import build_network
 from arcade_torch.agents.runs.files import read_csv
+from arcade_torch.models import check_memory, linear_scan, register_memory, registry
 from tests.agents.test_training import (
     assert_a_nan_stops,
     assert_same_run,
@@ -165,3 +172,53 @@ def test_a_mixed_run_is_evaluated_on_both_twins(tmp_path):
         for twin in ("full", "partial")
     )
     assert result.evaluation.returns.tolist() == full[:2] + partial[2:]
+
+
+class ComplexWeights(nn.Module):
+    """h_t = lambda h_{t-1} + B x_t with lambda and B as they stand in a paper."""
+
+    def __init__(self, input_size: int, hidden_size: int) -> None:
+        super().__init__()
+        self.input_size = input_size
+        self.hidden_size = hidden_size
+        self.decay = nn.Parameter(torch.polar(torch.rand(hidden_size), 3 * torch.rand(hidden_size)))
+        self.input = nn.Parameter(0.1 * torch.randn(hidden_size, input_size, dtype=torch.complex64))
+        self.output = nn.Linear(2 * hidden_size, hidden_size)
+
+    def forward(self, x: Tensor, state: TensorDict, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        written = F.linear(x.to(self.input.dtype), self.input)
+        start = torch.view_as_complex(state["h"].contiguous())
+        h = torch.view_as_real(linear_scan(self.decay, written, is_init, start))
+        last = TensorDict({"h": h[:, -1].clone()}, batch_size=[len(x)])
+        return self.output(h.flatten(-2)), last
+
+    def initial_state(self, batch_size: int) -> TensorDict:
+        zeros = self.output.weight.new_zeros(batch_size, self.hidden_size, 2)
+        return TensorDict({"h": zeros}, batch_size=[batch_size])
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "numbers"), [("pqn", {}), ("ppo", {"average_share": 0.3}), ("dqn", TARGET["dqn"])]
+)
+def test_a_memory_with_complex_weights_is_trained_and_goes_on_to_the_bit(
+    algorithm: str, numbers: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(registry, "_FACTORIES", dict(registry._FACTORIES))
+    register_memory("complex_weights", ComplexWeights)
+    check_memory(ComplexWeights(3, 4))
+    what = preset(
+        "smoke",
+        algorithm=algorithm,
+        **CHANGES | {"memory": "complex_weights"},
+        **{algorithm: numbers},
+    )
+    train(what, tmp_path / "whole")
+    with pytest.raises(ZeroDivisionError):
+        train(what, tmp_path / "parts", progress=stop_after(3, crash))
+    train(what, tmp_path / "parts", resume=True)
+    assert_same_run(tmp_path / "parts", tmp_path / "whole")
+    begun = build_network(what).state_dict()
+    learned = load(tmp_path / "whole").network.state_dict()
+    for name, weight in begun.items():
+        if weight.is_complex():
+            assert (learned[name] - weight).abs().min() > 0, name
