@@ -66,6 +66,13 @@ TOML = 'games = "SignpostEasy"\nmemories = ["mlp", "lru"]\nseeds = 1\npreset = "
             {"settings": {"network_options": {"memory_options": {"zork": 1}}}},
             "memory 'mingru' has other options: got an unexpected keyword argument 'zork'",
         ),
+        (
+            {
+                "memories": ["frame_stack", "mlp"],  # the first has such an option
+                "settings": {"network_options": {"memory_options": {"frames": 7}}},
+            },
+            "memory 'mlp' has other options: got an unexpected keyword argument 'frames'",
+        ),
         ({"settings": {"network": "zork"}}, "unknown network 'zork': known are paper, small"),
         ({"settings": {"env_options": {"zork": 1}}}, "has no option 'zork'"),
         ({"settings": {"obs_size": 48}}, "obs_size is 48, allowed: 128, 256"),
