@@ -227,6 +227,11 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError, match="holds no study"):
         carry_out(small_study(), tmp_path / "other", Fabricator(small_study()))
     assert os.listdir(tmp_path / "other") == ["thesis.tex"]
+    (tmp_path / "other" / "thesis.tex").rename(tmp_path / "thesis.tex")
+    (tmp_path / "other" / "study.json.lock").symlink_to(tmp_path / "thesis.tex")
+    with pytest.raises(FileExistsError, match="holds no study"):
+        carry_out(small_study(), tmp_path / "other", Fabricator(small_study()))
+    assert (tmp_path / "thesis.tex").read_text() == "precious"
 
 
 def test_a_study_with_other_settings_is_refused_but_a_larger_grid_is_welcome(

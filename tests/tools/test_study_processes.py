@@ -158,6 +158,12 @@ def test_every_worker_takes_as_many_runs_as_the_first(
     assert pids[0] == pids[1] != pids[2] == pids[3]
 
 
+def test_a_worker_that_ends_without_a_word_behind_one_that_failed_says_so(tmp_path: Path) -> None:
+    texts = ("raise SystemExit('no luck')", "import os; print('64', flush=True); os._exit(7)")
+    errors = [result.error for result in python_engine(1).run(jobs(tmp_path, *texts))]
+    assert errors == ["no luck", "ended without a word (exit code 7); its log ends with: 64"]
+
+
 def test_a_worker_knows_the_process_whose_end_is_its_own(tmp_path: Path) -> None:
     text = f"import os; assert os.environ[{PARENT_VARIABLE!r}] == '{os.getpid()}'"
     (result,) = python_engine(1).run(jobs(tmp_path, text))

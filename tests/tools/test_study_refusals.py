@@ -54,6 +54,10 @@ TOML = 'games = "SignpostEasy"\nmemories = ["mlp", "lru"]\nseeds = 1\npreset = "
             "settings may not hold network_options.layers: in this study the key sizes decides it",
         ),
         (
+            {"sizes": ["1x8"], "settings": {"network_options": {"hidden_size": 2}}},
+            "settings may not hold network_options.hidden_size: in this study the key sizes",
+        ),
+        (
             {"settings": {"network_options": {"zork": 1}}},
             "unknown network option zork; allowed are encoder, hidden_size",
         ),
