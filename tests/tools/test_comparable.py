@@ -17,6 +17,7 @@ from arcade_torch.tools.figures import CurveOptions, PaperOptions
 from arcade_torch.tools.figures.catalogue import make_figure
 from arcade_torch.tools.figures.logs import curves
 from arcade_torch.tools.figures.style import drawing
+from arcade_torch.tools.names import preset_size
 from arcade_torch.tools.reports import report
 from arcade_torch.tools.scores import read_scores
 from tests.tools.fabricated import small_study, write_study
@@ -217,15 +218,31 @@ def test_agents_that_were_trained_for_other_numbers_of_frames_are_compared_with_
     ]
 
 
-def test_a_folder_that_holds_another_run_than_its_name_says_is_refused(tmp_path: Path) -> None:
-    study = small_study()
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "holds a run of .*partial.*, not of .*full"),
+        (
+            {"observability": "full", "sizes": [preset_size("small"), "1x8"]},
+            f"holds a run of .*1x8, not of .*{preset_size('small')}",
+        ),
+        (
+            {"observability": "full", "sizes": ["1x8", preset_size("small")]},
+            f"holds a run of .*{preset_size('small')}, not of .*1x8",
+        ),
+    ],
+)
+def test_a_folder_that_holds_another_run_than_its_name_says_is_refused(
+    tmp_path: Path, changes: dict[str, Any], said: str
+) -> None:
+    study = small_study(**changes)
     folder = write_study(tmp_path / "s", study)
     one, other = (folder.run(run).path for run in study.runs()[:2])
     one.rename(tmp_path / "one")
     other.rename(one)
     (tmp_path / "one").rename(other)
     table = (folder.root / "results.csv").read_bytes()
-    with pytest.raises(ValueError, match=r"holds a run of .*partial.*, not of .*full") as refusal:
+    with pytest.raises(ValueError, match=said) as refusal:
         report(folder.root)
     assert "\n" not in str(refusal.value)
     assert (folder.root / "results.csv").read_bytes() == table

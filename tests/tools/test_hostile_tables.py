@@ -33,6 +33,7 @@ from tests.tools.fabricated import small_study, write_study
         {"seconds": -0.5},
         {"lengths": [3, 4]},
         {"returns": [], "lengths": []},
+        {"status": "interrupted"},
     ],
 )
 def test_a_final_evaluation_with_other_things_than_numbers_is_made_again(

@@ -188,8 +188,9 @@ def test_a_module_that_is_imported_only_when_the_model_runs_is_remembered_too(
     assert "beside_yours.py by way of" in said and "it has changed since: put it back" in said
 
 
+@pytest.mark.parametrize("is_finished", [True, False])
 def test_a_study_goes_on_with_runs_that_import_late(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
+    folder: Path, monkeypatch: pytest.MonkeyPatch, is_finished: bool
 ) -> None:
     """The process that plans them runs no model, and has not imported what they do."""
     (folder / "yours.py").write_text(LATE)
@@ -200,6 +201,9 @@ def test_a_study_goes_on_with_runs_that_import_late(
     run = place.run(cell).path
     settings = study().config(cell)
     write_run(run, cell, 0.5, settings=settings.to_dict())
+    if not is_finished:
+        (run / "eval.json").unlink()
+        (run / "checkpoints" / "frames-000000001024").mkdir(parents=True)
     importlib.import_module("beside_yours")
     (run / "config.json").write_text(
         json.dumps({"config": settings.to_dict(), "imports": imports.imports_of(settings)})

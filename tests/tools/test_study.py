@@ -9,6 +9,7 @@ import textwrap
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -192,9 +193,32 @@ def test_a_failing_run_does_not_lose_the_others_and_is_tried_again(tmp_path: Pat
     rows = carry_out(what, root, Fabricator(what, fail="partial__mlp"))
     failed = [row for row in rows if row["status"] == "failed"]
     assert len(failed) == 2 and failed[0]["error"] == "no luck"
+    timed = {row["run"] for row in read_csv(root / "timings.csv")}
+    assert timed == {row["run"] for row in rows if row["status"] == "finished"}
     again = Fabricator(what)
     assert all(row["status"] == "finished" for row in carry_out(what, root, again))
     assert again.done == [row["run"] for row in failed]
+    assert not list(root.glob("failures/*"))
+
+
+def test_a_run_is_finished_if_its_final_evaluation_is_there_whatever_its_engine_says(
+    tmp_path: Path,
+) -> None:
+    class Liar(Fabricator):
+        """Says of a run that is finished that it failed, and of one that is not the contrary."""
+
+        def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
+            killed, idle, *others = list(jobs)
+            write_run(killed.folder, self.runs[killed.name], 0.5)
+            yield JobResult(killed.name, "ended by signal 9")
+            yield JobResult(idle.name)
+            yield from super().run(others)
+
+    what = small_study()
+    result = study(what, tmp_path / "s", Liar(what), stream=io.StringIO())
+    assert list(result.errors) == [what.runs()[1].name]
+    states = [(row["status"], row["error"]) for row in result.rows[:2]]
+    assert states == [("finished", ""), ("failed", "ended without a final evaluation")]
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
@@ -203,6 +227,11 @@ def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
     with pytest.raises(FileExistsError, match="holds no study"):
         carry_out(small_study(), tmp_path / "other", Fabricator(small_study()))
     assert os.listdir(tmp_path / "other") == ["thesis.tex"]
+    (tmp_path / "other" / "thesis.tex").rename(tmp_path / "thesis.tex")
+    (tmp_path / "other" / "study.json.lock").symlink_to(tmp_path / "thesis.tex")
+    with pytest.raises(FileExistsError, match="holds no study"):
+        carry_out(small_study(), tmp_path / "other", Fabricator(small_study()))
+    assert (tmp_path / "thesis.tex").read_text() == "precious"
 
 
 def test_a_study_with_other_settings_is_refused_but_a_larger_grid_is_welcome(
@@ -301,18 +330,25 @@ def test_what_does_not_change_a_result_lets_a_study_go_on(
     assert engine.done == []
 
 
-def test_two_shards_may_begin_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    what, root, exists, other = small_study(), tmp_path / "s", Path.exists, [True]
+@pytest.mark.parametrize("theirs", [small_study(), small_study(total_frames=4096)])
+def test_two_may_begin_at_once_if_they_are_shards_of_one_study(
+    theirs: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, exists, other = tmp_path / "s", Path.exists, [True]
 
     def late(path: Path, **how: Any) -> bool:
         found = exists(path, **how)
         if path.name == "study.json" and other and other.pop():
-            StudyFolder(root).claim(what, "the other shard")  # between this look and the next
+            StudyFolder(root).claim(theirs, "the other")  # between this look and the next
         return found
 
     monkeypatch.setattr(Path, "exists", late)
-    StudyFolder(root).claim(what, "this shard")
-    assert StudyFolder(root).load() == what and not other
+    if theirs == small_study():
+        StudyFolder(root).claim(small_study(), "this shard")
+    else:
+        with pytest.raises(FileExistsError, match="total_frames = 4096, not 2048"):
+            StudyFolder(root).claim(small_study(), "this")
+    assert StudyFolder(root).load() == theirs and not other
 
 
 def test_versions_of_the_first_runs_stay_on_record(
@@ -321,11 +357,13 @@ def test_versions_of_the_first_runs_stay_on_record(
     folder = StudyFolder(tmp_path / "s")
     folder.claim(small_study(), "first")
     before = folder.record()["versions"]
-    monkeypatch.setattr("arcade_torch.tools.studies.folder.versions", lambda: {"torch": "99"})
-    for _ in range(2):
+    for release in ("98", "99", "99"):
+        current = {"torch": release}
+        monkeypatch.setattr("arcade_torch.tools.studies.folder.versions", lambda now=current: now)
         folder.claim(small_study(seeds=3), "second")
     record = folder.record()
-    assert record["versions"] == before and record["also"] == [{"torch": "99"}]
+    assert record["versions"] == before
+    assert record["also"] == [{"torch": "98"}, {"torch": "99"}]
     assert record["command"] == "second" and len(record["runs"]) == 12
 
 
@@ -506,6 +544,8 @@ def test_options_of_a_preset_stay_where_a_study_gives_others() -> None:
     config = what.config(what.runs()[0])
     assert config.network_options == {"skip": "none", "layers": 1, "hidden_size": 64}
     assert config.env_options == {"noise": 1}
+    other = small_study(preset="reference", settings={"network_options": {"skip": "residual"}})
+    assert other.config(other.runs()[0]).network_options["skip"] == "residual"
 
 
 def test_a_setting_that_does_not_exist_is_refused_before_anything_is_written(
@@ -548,6 +588,18 @@ def test_a_study_on_a_full_disk_stops_at_the_first_run_that_fails_for_it(tmp_pat
     assert len(engine.done) == 1
 
 
+def test_without_room_a_run_that_fails_ends_a_study_and_one_that_succeeds_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "arcade_torch.tools.studies.runner.shutil.disk_usage", lambda _: SimpleNamespace(free=0)
+    )
+    what = small_study()
+    assert len(carry_out(what, tmp_path / "fine", Fabricator(what))) == 8
+    with pytest.raises(DiskFullError, match="no luck"):
+        carry_out(what, tmp_path / "full", Fabricator(what, fail="mlp"))
+
+
 def test_a_run_that_another_process_finished_meanwhile_has_not_failed(tmp_path: Path) -> None:
     class Second(Fabricator):
         """Finds a run in training, which is finished before the last of its own is."""
@@ -564,6 +616,7 @@ def test_a_run_that_another_process_finished_meanwhile_has_not_failed(tmp_path: 
     assert list(result.errors) == [what.runs()[1].name]
     assert result.finished == len(what.runs()) - 1
     assert [row["error"] for row in result.rows if row["error"]] == ["no luck"]
+    assert len(list((tmp_path / "s" / "failures").iterdir())) == 1
 
 
 def test_the_presets_are_studies() -> None:
@@ -586,6 +639,9 @@ def test_options_of_one_memory_stand_under_its_name(tmp_path: Path) -> None:
         assert options == ({"frames": 7} if run.memory == "frame_stack" else {})
     assert Study.from_dict(json.loads(json.dumps(what.to_dict()))) == what
     other = replace(what, memory_options={"frame_stack": {"frames": 8}})
+    StudyFolder(tmp_path / "begun").claim(what)
+    with pytest.raises(FileExistsError, match=r"memory_options = .*7.*, not .*8"):
+        StudyFolder(tmp_path / "begun").claim(other)
     study(what, tmp_path / "s", Fabricator(what), stream=io.StringIO())
     with pytest.raises(FileExistsError, match="memory_options"):
         study(other, tmp_path / "s", Fabricator(what), stream=io.StringIO())
@@ -597,3 +653,17 @@ def test_options_of_one_memory_stand_under_its_name(tmp_path: Path) -> None:
         file.write_text(f"{text}{options}\n")
         with pytest.raises((ValueError, TypeError), match=said):
             planned(Study.load(file))
+
+
+def test_options_of_one_memory_go_before_those_of_all_and_to_no_other() -> None:
+    common = {"heads": 2, "window": 5}
+    what = small_study(
+        memories=["attention", "mlp"],
+        settings={"network_options": {"memory_options": common}},
+        memory_options={"attention": {"window": 7}},
+    )
+    for _ in range(2):
+        for run in what.runs():
+            window = 7 if run.memory == "attention" else 5
+            expected = {"heads": 2, "window": window}
+            assert what.config(run).network_options["memory_options"] == expected

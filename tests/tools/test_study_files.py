@@ -110,6 +110,33 @@ def test_files_that_travel_back_stay_in_the_folder_of_their_run(tmp_path: Path, 
     assert [path for path in tmp_path.rglob("*") if path.is_file()] == []
 
 
+def test_the_final_evaluation_is_there_only_if_all_that_travelled_with_it_is(
+    tmp_path: Path,
+) -> None:
+    (job(tmp_path).folder / "metrics.csv").mkdir(parents=True)  # so that no file can be written
+    returned: Any = Returned({"eval.json": b"{}", "metrics.csv": b"frames"})
+    with pytest.raises(OSError):
+        engines._result(returned, None, job(tmp_path))
+    assert not (job(tmp_path).folder / "eval.json").exists()
+
+
+def test_runs_of_two_studies_on_one_machine_are_kept_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They may have equal names and configs."""
+    monkeypatch.setattr(engines.tempfile, "gettempdir", lambda: str(tmp_path / "disk"))
+    folders = []
+
+    def attempt(self: Job) -> tuple[str, str]:
+        folders.append(self.folder)
+        return "no luck", ""
+
+    monkeypatch.setattr(Job, "attempt", attempt)
+    for study in ("one", "other", "one"):
+        carry_out(job(tmp_path / study), b"{}")
+    assert folders[0] == folders[2] != folders[1]
+
+
 def test_files_do_not_travel_back_through_a_link(tmp_path: Path) -> None:
     (tmp_path / "outside").mkdir()
     run = job(tmp_path).folder

@@ -91,6 +91,8 @@ def test_the_table_is_written_while_a_study_goes_on(
 
     class Slow(Fabricator):
         def run(self, jobs: Iterable[Job]) -> Iterator[JobResult]:
+            rows = read_csv(tmp_path / "s" / "results.csv")
+            assert [row["status"] for row in rows] == ["waiting"] * 4
             for place, result in enumerate(super().run(jobs)):
                 yield result
                 rows = read_csv(tmp_path / "s" / "results.csv")
@@ -142,10 +144,11 @@ def test_a_dry_run_of_ten_thousand_seeds_ends_soon(
     assert said.out.count("\n") == 40_000 and "40,000 runs" in said.err
 
 
-def test_finished_runs_keep_their_rows(tmp_path: Path) -> None:
+def test_finished_runs_keep_their_rows(tmp_path: Path, reads: Counter[str]) -> None:
     what = small_study()
     folder = write_study(tmp_path / "s", what)
-    known: dict[Any, Any] = {}
-    rows = folder.write_results(what, known)
-    assert len(known) == 8
-    assert folder.write_results(what, known) == rows == folder.write_results(what)
+    results = runner.Results(folder, what)
+    rows = results.write()
+    reads.clear()
+    assert results.write() == rows and reads["eval.json"] == 0
+    assert folder.write_results(what) == rows and reads["eval.json"] == 8

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from arcade_torch.tools.machine import available_cores
+from arcade_torch.tools.machine import PARENT_VARIABLE, available_cores
 from arcade_torch.tools.studies import processes, runner
 from arcade_torch.tools.studies.engines import Ray
 from arcade_torch.tools.studies.processes import Processes
@@ -146,6 +146,28 @@ def test_a_worker_that_has_worked_for_long_takes_no_further_run(
     parts = jobs(tmp_path, note_pid(tmp_path, 0), note_pid(tmp_path, 1))
     assert [result.error for result in python_engine(1).run(parts)] == ["", ""]
     assert pid_of(tmp_path, 0) != pid_of(tmp_path, 1)
+
+
+def test_every_worker_takes_as_many_runs_as_the_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processes, "MOST_RUNS", 2)
+    parts = jobs(tmp_path, *(note_pid(tmp_path, number) for number in range(4)))
+    assert [result.error for result in python_engine(1).run(parts)] == [""] * 4
+    pids = [pid_of(tmp_path, number) for number in range(4)]
+    assert pids[0] == pids[1] != pids[2] == pids[3]
+
+
+def test_a_worker_that_ends_without_a_word_behind_one_that_failed_says_so(tmp_path: Path) -> None:
+    texts = ("raise SystemExit('no luck')", "import os; print('64', flush=True); os._exit(7)")
+    errors = [result.error for result in python_engine(1).run(jobs(tmp_path, *texts))]
+    assert errors == ["no luck", "ended without a word (exit code 7); its log ends with: 64"]
+
+
+def test_a_worker_knows_the_process_whose_end_is_its_own(tmp_path: Path) -> None:
+    text = f"import os; assert os.environ[{PARENT_VARIABLE!r}] == '{os.getpid()}'"
+    (result,) = python_engine(1).run(jobs(tmp_path, text))
+    assert result.error == ""
 
 
 def test_a_worker_that_waits_ends_with_its_study(tmp_path: Path) -> None:

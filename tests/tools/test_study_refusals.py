@@ -54,6 +54,10 @@ TOML = 'games = "SignpostEasy"\nmemories = ["mlp", "lru"]\nseeds = 1\npreset = "
             "settings may not hold network_options.layers: in this study the key sizes decides it",
         ),
         (
+            {"sizes": ["1x8"], "settings": {"network_options": {"hidden_size": 2}}},
+            "settings may not hold network_options.hidden_size: in this study the key sizes",
+        ),
+        (
             {"settings": {"network_options": {"zork": 1}}},
             "unknown network option zork; allowed are encoder, hidden_size",
         ),
@@ -65,6 +69,13 @@ TOML = 'games = "SignpostEasy"\nmemories = ["mlp", "lru"]\nseeds = 1\npreset = "
         (
             {"settings": {"network_options": {"memory_options": {"zork": 1}}}},
             "memory 'mingru' has other options: got an unexpected keyword argument 'zork'",
+        ),
+        (
+            {
+                "memories": ["frame_stack", "mlp"],  # the first has such an option
+                "settings": {"network_options": {"memory_options": {"frames": 7}}},
+            },
+            "memory 'mlp' has other options: got an unexpected keyword argument 'frames'",
         ),
         ({"settings": {"network": "zork"}}, "unknown network 'zork': known are paper, small"),
         ({"settings": {"env_options": {"zork": 1}}}, "has no option 'zork'"),

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import warnings
 
 import pytest
 import torch
@@ -32,6 +33,20 @@ def test_what_is_saved_is_loaded(tmp_path):
     assert (found.frames, found.config) == (64, CONFIG)
     assert torch.equal(found.weights["w"], torch.full((4,), 2.5))
     assert torch.equal(found.trainer["h"]["a"]["b"], torch.full((2, 3), 2.5))
+
+
+def test_weights_that_two_names_share_are_saved_under_both(tmp_path):
+    tied = torch.rand(2, 3)
+    path = save_checkpoint(tmp_path, CONFIG, 64, {"in": tied, "out": tied, "row": tied[1]}, {})
+    weights = load_checkpoint(path).weights
+    assert torch.equal(weights["in"], tied) and torch.equal(weights["out"], tied)
+    assert torch.equal(weights["row"], tied[1])
+
+
+def test_the_newest_is_the_one_that_was_saved_last_not_the_one_with_most_frames(tmp_path):
+    save(tmp_path, 192, 1.0)
+    save(tmp_path, 128, 2.0)
+    assert load_latest(tmp_path).frames == 128
 
 
 def test_the_last_two_are_kept_and_the_newest_comes_first(tmp_path):
@@ -123,9 +138,12 @@ def test_a_process_that_dies_while_saving_leaves_the_previous_checkpoint(tmp_pat
             patch.setattr(module, name, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
             with pytest.raises(KeyboardInterrupt):
                 save(tmp_path, 128, 2.0)
-        assert load_latest(tmp_path, expect=CONFIG).frames == 64
+        assert not list(tmp_path.glob(".frames*"))
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            assert load_latest(tmp_path, expect=CONFIG).frames == 64
     save(tmp_path, 128, 2.0)
-    assert load_latest(tmp_path).frames == 128 and not list(tmp_path.glob(".frames*"))
+    assert load_latest(tmp_path).frames == 128
 
 
 def test_code_hidden_in_a_checkpoint_is_not_run(tmp_path):
@@ -141,6 +159,16 @@ def test_code_hidden_in_a_checkpoint_is_not_run(tmp_path):
     with pytest.raises(CheckpointError, match=r"trainer\.pt"):
         load_checkpoint(path)
     assert not (tmp_path / "sprung").exists()
+
+
+def test_of_a_log_only_whole_lines_are_read_and_a_newer_version_may_have_other_columns(tmp_path):
+    file = tmp_path / "m.csv"
+    file.write_text("frames,x,old\n10,1,2\n20\n30,1,2,3\nabc,1,2\n40,3,4\n50,5,")
+    assert [row["frames"] for row in read_csv(file, strict=False)] == ["10", "40"]
+    log = CsvLog(file, ("frames", "new", "x"), keep_frames=50)
+    log.append({"frames": 50, "new": 7, "x": 8})
+    log.close()
+    assert file.read_text() == "frames,new,x\n10,,1\n40,,3\n50,7,8\n"
 
 
 def test_a_log_is_cut_back_to_a_frame_count(tmp_path):

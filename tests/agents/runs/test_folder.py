@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -90,6 +91,40 @@ def test_a_killed_process_frees_the_folder_at_once_and_what_it_left_half_written
             "replay",
             "window-000000000.safetensors",
         ]
+
+
+def test_a_run_remembers_the_imports_it_goes_on_with_and_how_it_began(tmp_path: Path) -> None:
+    old = [{"name": "mine.py", "sha256": "0" * 64}]
+    new = [{"name": "mine.py", "sha256": "1" * 64}]
+    records = []
+    for imports in (old, new, []):
+        with RunFolder(tmp_path, imports).claim(CONFIG):
+            records.append(json.loads((tmp_path / "config.json").read_text()))
+    assert records[0]["imports"] == old
+    assert records[1] == records[2] == records[0] | {"imports": new}
+
+
+def test_progress_is_written_once_a_second_and_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = RunFolder(tmp_path)
+    with folder.claim(CONFIG), monkeypatch.context() as patch:
+        written = []
+        for now_s, status in ((9.0, "running"), (9.9, "running"), (10.1, "running")):
+            patch.setattr(time, "monotonic", lambda now_s=now_s: now_s)
+            folder.report(int(10 * now_s), 192, status)
+            written.append(json.loads((tmp_path / "progress.json").read_text())["frames"])
+        folder.report(192, 192, "finished")
+    assert written == [90, 90, 101]
+    assert json.loads((tmp_path / "progress.json").read_text())["status"] == "finished"
+
+
+def test_a_final_evaluation_without_a_count_of_frames_is_made_again(tmp_path: Path) -> None:
+    final = {"status": "finished", "seconds": 1.0, "mean": 0.5, "train_max_ewm": None}
+    final |= {"returns": [0.5], "lengths": [3]}
+    for frames, is_finished in ((64, True), (None, False)):
+        (tmp_path / "eval.json").write_text(json.dumps(final | {"frames": frames}))
+        assert (RunFolder(tmp_path).finished() is not None) == is_finished
 
 
 def test_a_lock_alone_does_not_make_a_folder_taken(tmp_path: Path) -> None:

@@ -7,7 +7,9 @@ import io
 import os
 import socket
 import stat
+import threading
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -257,3 +259,32 @@ def test_a_full_disk_names_the_file_and_leaves_the_old_one(
     assert read_json(path) == {"old": 1} and [entry.name for entry in tmp_path.iterdir()] == [
         "file.json"
     ]
+
+
+def test_an_interruption_leaves_the_old_file_alone_in_its_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_json(tmp_path / "file.json", {"old": 1})
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "replace", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            write_json(path, {"new": 2})
+    assert read_json(path) == {"old": 1} and list(tmp_path.iterdir()) == [path]
+
+
+def test_threads_may_replace_one_file_at_the_same_time(tmp_path: Path) -> None:
+    path = tmp_path / "file.json"
+    begin = threading.Barrier(4)
+
+    def replace_often(number: int) -> None:
+        begin.wait()
+        for _ in range(100):
+            write_json(path, [number] * 100)
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(replace_often, range(4)))
+    assert len(set(read_json(path))) == 1 and list(tmp_path.iterdir()) == [path]

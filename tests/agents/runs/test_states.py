@@ -16,7 +16,7 @@ from arcade_torch.agents import preset, train
 from arcade_torch.agents.learner import NonFiniteError
 from arcade_torch.agents.runs.checkpoint import Checkpoint, list_checkpoints, load_checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
-from arcade_torch.agents.runs.states import check_state
+from arcade_torch.agents.runs.states import check_optimizer, check_state
 from arcade_torch.agents.trainer import Trainer
 
 OVERLAP = {"overlap": 4, "time_limit": "bootstrap"}
@@ -155,6 +155,7 @@ def test_types_and_sizes_are_compared() -> None:
         {"a": "1"},
         {"b": [0.5]},
         {"b": [0.5, torch.zeros(3)]},
+        {"b": [0.5, torch.zeros(2, dtype=torch.float64)]},
         {"b": 3},
         {"c": "x"},
         {"d": 1},
@@ -163,6 +164,25 @@ def test_types_and_sizes_are_compared() -> None:
     for saved in wrong:
         with pytest.raises(ValueError, match="expected "):
             check_state(saved, expected)
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        {"exp_avg": torch.zeros(3)},
+        {"exp_avg_sq": torch.zeros(3)},
+        {"exp_avg_sq": torch.zeros(2, dtype=torch.float64)},
+        {"step": torch.tensor(-1.0)},
+        {"more": torch.zeros(2)},
+    ],
+)
+def test_averages_of_the_optimiser_are_those_of_its_weights(forged: dict[str, Any]) -> None:
+    weights = [torch.nn.Parameter(torch.zeros(2))]
+    averages = {"step": torch.tensor(3.0), "exp_avg": torch.ones(2), "exp_avg_sq": torch.ones(2)}
+    check_optimizer({"state": {0: averages}}, weights)
+    for state in ({0: averages | forged}, {1: averages}):
+        with pytest.raises(ValueError, match="expected "):
+            check_optimizer({"state": state}, weights)
 
 
 def test_options_of_the_optimiser_are_those_of_the_config(run: tuple[Trainer, Checkpoint]) -> None:

@@ -12,7 +12,7 @@ from arcade_torch.tools.board.check import CheckRecord, write_record
 from arcade_torch.tools.board.entry import EntryRefusedError, entry_of
 from arcade_torch.tools.board.page import BEGIN, END, board, read_entries, write_page
 from arcade_torch.tools.board.protocol import QUICK, Suite, frames_class, suites
-from arcade_torch.tools.board.ranking import Listed, ranking, suite_iqm
+from arcade_torch.tools.board.ranking import Listed, has_suite, ranking, suite_iqm
 from arcade_torch.tools.measures.gap_bias.measure import generator_of, normalise
 from tests.tools.board.boards import GAME, fabricated_entry
 
@@ -173,3 +173,15 @@ def test_a_falsified_file_stops_the_page_and_two_of_one_name_do(tmp_path: Path) 
     (results / "leaderboard" / "b.json").write_text(json.dumps(plain))
     with pytest.raises(EntryRefusedError, match=f"missing cell: {GAME} full, seed 1"):
         board(results)
+
+
+def test_a_rank_takes_both_twins_and_an_interval_several_seeds_of_every_game() -> None:
+    suite = QUICK_SUITE
+    cells = {(game, twin): [0.1, 0.9] for game in suite.games for twin in ("full", "partial")}
+    assert has_suite(cells, suite) and suite_iqm(cells, suite, "partial").exists
+    single = cells | {(suite.games[0], "partial"): [0.5]}
+    assert not suite_iqm(single, suite, "partial").exists
+    for twin in ("full", "partial"):
+        lacking = dict(cells)
+        del lacking[suite.games[0], twin]
+        assert not has_suite(lacking, suite)
