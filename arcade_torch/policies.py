@@ -137,12 +137,23 @@ class PolicyRunner:
         td = self._policy(td)
         if not isinstance(td, TensorDictBase) or "action" not in td:
             _refuse_output(td)
-        carried = TensorDict({}, batch_size=self._size, device=self._device)
+        stored, carried = self._take_apart(td, state)
+        if self._varies and obs["is_init"].any():
+            self._initial = self._first_values()
+        return td["action"], stored, carried
+
+    def _take_apart(
+        self, td: TensorDictBase, state: TensorDict
+    ) -> tuple[dict[NestedKey, torch.Tensor], TensorDict]:
+        """The entries of a policy's output that are stored, and the state after the step; what else
+        it wrote to the root is kept for its next step.
+        """
         stored: dict[NestedKey, torch.Tensor] = {}
-        states = set(map(path_of, state.keys(True, True)))
         left: dict[NestedKey, torch.Tensor] = {}
+        carried = TensorDict({}, batch_size=self._size, device=self._device)
         for key, value in state.items(True, True):
             carried[key] = td.get(key, value)  # unless the policy writes another for the next step
+        states = set(map(path_of, state.keys(True, True)))
         for key, value in td.items(True, True):
             path = path_of(key)
             if path[0] == "next" and path[1:] in self._outcomes:
@@ -155,9 +166,7 @@ class PolicyRunner:
             if path[0] not in self._known and self._keeps(path, is_state):
                 stored[key] = value
         self._left = left if self._shows_left else {}
-        if self._varies and obs["is_init"].any():
-            self._initial = self._first_values()
-        return td["action"], stored, carried
+        return stored, carried
 
     def show_action(self, action: torch.Tensor) -> None:
         """Put the action that was taken in the place of the policy's."""
