@@ -92,8 +92,8 @@ def pooled(
 ) -> Pooled:
     """Pool the arrays of some seeds, cell by cell.
 
-    NaN is a seed without a value. The ends are NaN where fewer than two seeds have one, the mean
-    where none has.
+    NaN or infinite is a seed without a value. The ends are NaN where fewer than two seeds have one,
+    the mean where none has.
     """
 
     def cell(seeds: Array) -> Array:
@@ -115,8 +115,8 @@ def pooled_episodes(
     """Pool the episodes of some seeds, each [n_episodes, L], column by column: the mean over seeds
     of their means over episodes, both resampled.
 
-    NaN is an episode without a value. Of a single seed the interval is over its episodes alone; the
-    ends are NaN where fewer than two episodes have a value, the mean where none has.
+    NaN or infinite is an episode without a value. Of a single seed the interval is over episodes
+    alone; the ends are NaN where fewer than two of them have a value, the mean where none has.
     """
     arrays = [np.asarray(episodes, dtype=np.float64) for episodes in seeds]
     columns = arrays[0].shape[1]
