@@ -19,6 +19,8 @@ from typing import (
     get_type_hints,
 )
 
+from arcade_torch.envs_jax.validation import format_value
+
 
 class Range(NamedTuple):
     """Values that a field may hold: in words, and as a test."""
@@ -43,8 +45,7 @@ def require(condition: bool, name: str, value: Any, allowed: str) -> None:
     is allowed.
     """
     if not condition:
-        one_line = " ".join(line.strip() for line in repr(value).splitlines())
-        raise ValueError(f"{name} must be {allowed}; got {one_line}")
+        raise ValueError(f"{name} must be {allowed}; got {format_value(value)}")
 
 
 def whole_from(least: int, name: str, value: Any) -> int:
@@ -56,7 +57,7 @@ def whole_from(least: int, name: str, value: Any) -> int:
     try:
         number = operator.index(value)
     except TypeError as error:
-        raise ValueError(f"{name} must be {allowed}; got {value!r}") from error
+        raise ValueError(f"{name} must be {allowed}; got {format_value(value)}") from error
     require(number >= least, name, value, f"at least {least}")
     return number
 
