@@ -155,13 +155,14 @@ def laws(name: str) -> str:
 
 def card(name: str) -> str:
     """What the card of a memory model says, from its JSON file."""
+    from arcade_torch.tools.cards.page import reach_text
+
     found = _card(name)
     context = found["context"]
-    reach = found["reach"]
     rows = [
         ("context length, before training", context["text"]),
-        ("gradient reach, a tenth of the largest", f"{reach['tenth']} steps"),
-        ("gradient reach, a hundredth of the largest", f"{reach['hundredth']} steps"),
+        ("gradient reach, a tenth of the largest", reach_text(found, "tenth")),
+        ("gradient reach, a hundredth of the largest", reach_text(found, "hundredth")),
     ]
     for rival, ratio in _ratios(found).items():
         rows.append((f"time of learning, `{rival}` is 1", f"{ratio['learning_us']:.2f}"))
@@ -176,6 +177,8 @@ def card(name: str) -> str:
 
 def cards(_: str) -> str:
     """The cards of all built-in memory models, a line each."""
+    from arcade_torch.tools.cards.page import reach_text
+
     heads = ["memory", "laws kept", "parameters", "state, bytes", "context length"]
     heads += ["a tenth of the gradient", "learning, GRU is 1", "acting, GRU is 1"]
     heads += ["solved, learned sizes", "solved, larger sizes"]
@@ -190,7 +193,7 @@ def cards(_: str) -> str:
             f"{size['parameters']:,}",
             f"{size['state_bytes']:,}",
             found["context"]["text"],
-            f"{found['reach']['tenth']} steps",
+            reach_text(found, "tenth"),
         ]
         ratio = _ratios(found).get("gru", {"learning_us": 1.0, "acting_us": 1.0})
         cells += [f"{ratio['learning_us']:.2f}", f"{ratio['acting_us']:.2f}"]

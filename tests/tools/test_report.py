@@ -176,6 +176,23 @@ def test_a_mean_over_fewer_tasks_is_said_to_be_one(
     assert re.search(r"mean of the MDPs</td><td>0\.63[23]</td>", page)
 
 
+def test_a_mean_of_the_subject_over_fewer_tasks_is_said_to_be_one(
+    tmp_path: Path, no_oracles: None
+) -> None:
+    """Before: its POMDPs were all games, its MDPs one less, and nothing said so."""
+    games = ["MineSweeperEasy", "CartPoleEasy"]
+    study = small_study(subject="mingru", baseline="gru", games=games)
+    folder = write_study(tmp_path / "s", study)
+    for run in study.runs():
+        if (run.game, run.memory, run.observability) == ("CartPoleEasy", "mingru", "full"):
+            shutil.rmtree(folder.run(run).path)
+    parts = ("saliency", "recall", "counterfactual", "beliefs", "contamination")
+    page = report(folder.root, skip=parts).read_text()
+    assert "on the MDP, 1 of 2 tasks, mingru reaches" in page
+    assert "On the POMDP mingru reaches" in page
+    assert "mingru has no finished run on CartPoleEasy MDP: all means are of the other" in page
+
+
 @pytest.mark.parametrize("score", [math.nan, math.inf, -math.inf])
 def test_a_run_without_a_score_is_not_averaged_away(
     score: float, tmp_path: Path, no_oracles: None

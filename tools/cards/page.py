@@ -1,10 +1,12 @@
 """A card as one HTML page that loads nothing."""
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from arcade_torch.tools.cards.measure import DELAYS, LAW_SIZES, REACH_WIDTH
 from arcade_torch.tools.figures import style
+from arcade_torch.tools.measures.bootstrap import Interval
 from arcade_torch.tools.reports import page_environment
 
 Card = Mapping[str, Any]
@@ -51,8 +53,7 @@ def findings(card: Card) -> list[str]:
     if card["tests"]:
         lines.append(_tests_sentence(card["tests"]))
     if card["study"]:
-        gap = card["study"]["gap"][0]
-        lines.append(f"Partial observability costs agents with it {gap:.2f} of normalised return.")
+        lines.append(_gap_sentence(card["study"]))
     return lines
 
 
@@ -65,6 +66,33 @@ def ratios(card: Card) -> dict[str, dict[str, float]]:
         if subject and rival != card["name"]:
             by_rival[rival] = {name: subject[name] / times[name] for name in times}
     return by_rival
+
+
+def reach_text(card: Card, share: str) -> str:
+    """The largest lag at which the gradient is a ``tenth`` or a ``hundredth`` of the largest, in
+    words.
+    """
+    steps = card["reach"][share]
+    words = "1 step" if steps == 1 else f"{steps} steps"
+    is_last = steps >= len(card["reach"]["norms"]) - 1
+    return f"{words} or more" if is_last else words
+
+
+def _gap_sentence(study: Mapping[str, Any]) -> str:
+    """What partial observability costs, and how sure it is."""
+    value, low, high = (math.nan if end is None else end for end in study["gap"])
+    gap = Interval(value, low, high)
+    decimals = gap.decimals()
+    fact = f"Partial observability costs agents with it {value:.{decimals}f}"
+    if not gap.exists:
+        return f"{fact}, with a single seed, which says nothing about others."
+    ends = f"[{low:.{decimals}f}, {high:.{decimals}f}]"
+    if gap.excludes_zero:
+        return f"{fact} {ends} of normalised return."
+    return (
+        f"{fact} of normalised return, but the interval {ends} contains zero, so "
+        f"{study['seeds']} seeds do not settle it."
+    )
 
 
 def _laws_sentence(laws: Any) -> str:
@@ -107,8 +135,8 @@ def _reach_picture(card: Card, colour: str) -> dict[str, str]:
     axis.set_title("Gradient reach")
     return {
         "picture": style.svg(figure, "gradient reach"),
-        "caption": f"at least a tenth up to {card['reach']['tenth']} steps back, a hundredth up to "
-        f"{card['reach']['hundredth']}",
+        "caption": f"a tenth for the last time {reach_text(card, 'tenth')} back, a hundredth "
+        f"{reach_text(card, 'hundredth')} back",
     }
 
 

@@ -28,6 +28,24 @@ class Interval(NamedTuple):
         """Whether there is an interval and zero lies outside it."""
         return bool(self.low > 0 or self.high < 0)
 
+    @property
+    def is_zero(self) -> bool:
+        """Whether there is no difference in any seed: the number and both ends are 0."""
+        return self.value == self.low == self.high == 0
+
+    def decimals(self, fewest: int = 2) -> int:
+        """Decimals at which an interval that excludes zero is seen to, at least ``fewest``.
+
+        Example:
+            >>> Interval(0.002, 0.0004, 0.004).decimals()
+            4
+        """
+        near = min(abs(self.low), abs(self.high))
+        decimals = fewest
+        while self.excludes_zero and round(near, decimals) == 0 and decimals < 12:
+            decimals += 1
+        return decimals
+
     def text(self) -> str:
         """The number and its interval for a table; a dash where there is no number.
 
@@ -48,8 +66,16 @@ def resampled(cells: Sequence[Array], draws: int, rng: np.random.Generator) -> l
 
 
 def mean_over_tasks(cells: Sequence[Array]) -> Array:
-    """Mean over tasks of the means over seeds: [..., n_seeds] a task to [...]."""
-    means = [cell.mean(axis=-1) for cell in cells]
+    """Mean over tasks of the means over seeds: [..., n_seeds] a task to [...].
+
+    The mean of seeds that are all alike is what they are, to the last bit: three times .7 add up to
+    less than 2.1, and an agent with two such seeds would be ahead of one with three.
+    """
+    means = []
+    for cell in cells:
+        mean = cell.mean(axis=-1)
+        first = cell[..., 0]
+        means.append(np.where((cell == first[..., None]).all(axis=-1), first, mean))
     return np.asarray(sum(means) / len(means))
 
 
@@ -102,7 +128,7 @@ def pooled(
         if finite.size < 2:
             return np.array([finite[0] if finite.size else np.nan, np.nan, np.nan])
         drawn = mean_over_tasks(resampled([finite], draws, np.random.default_rng(seed)))
-        return np.array(percentile_interval(finite.mean(), drawn, confidence))
+        return np.array(percentile_interval(mean_over_tasks([finite]), drawn, confidence))
 
     all_seeds = np.array(values, dtype=np.float64)
     mean, low, high = np.apply_along_axis(cell, 0, all_seeds)

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from arcade_torch.tools.figures.style import TWIN_NAMES
 from arcade_torch.tools.measures.bootstrap import Interval
 from arcade_torch.tools.measures.gap_bias.measure import AgentRow, GapBias
-from arcade_torch.tools.reports.subject import TRUSTED_COVERAGE
+from arcade_torch.tools.reports.subject import TRUSTED_COVERAGE, signed
 
 
 def score_sentences(table: GapBias, subject: str) -> list[str]:
@@ -47,24 +47,30 @@ def gap_sentence(table: GapBias, memory_free: AgentRow, agent: AgentRow) -> str:
         f"normalised return and {agent.agent} {agent.gap.value:.2f}"
     )
     difference = table.difference("gap", memory_free.agent, agent.agent)
-    size = abs(difference.value)
+    size = f"{abs(difference.value):.{difference.decimals()}f}"
+    # a gap below zero that rises to zero is no wider
+    is_signed = min(memory_free.gap.value, agent.gap.value) < 0
     seeds = min(memory_free.seeds, agent.seeds)
     if not difference.exists:
         return (
             f"{fact}: a difference of {difference.value:+.2f} with a single seed, which says "
             "nothing about others."
         )
+    if difference.is_zero:
+        return f"{fact}: the gap is the same in every seed."
     if not difference.excludes_zero:
-        side = "smaller" if difference.value > 0 else "larger"
+        smaller, larger = ("lower", "higher") if is_signed else ("smaller", "larger")
+        side = smaller if difference.value > 0 else larger
         return (
-            f"{fact}: with memory the gap is {size:.2f} {side}, but the interval "
+            f"{fact}: with memory the gap is {size} {side}, but the interval "
             f"{_ends(difference)} contains zero, so {seeds} seeds do not settle it."
         )
-    coverage = min(memory_free.coverage, agent.coverage)
-    memory = "memory" if coverage >= TRUSTED_COVERAGE else f"over these {seeds} seeds memory"
-    effect = "narrows" if difference.value > 0 else "widens"
-    near, far = sorted((abs(difference.low), abs(difference.high)))
-    return f"{fact}: {memory} {effect} the observability gap by {size:.2f} [{near:.2f}, {far:.2f}]."
+    memory = f"{_few_seeds(memory_free, agent)} memory".strip()
+    narrows, widens = ("lowers", "raises") if is_signed else ("narrows", "widens")
+    effect = narrows if difference.value > 0 else widens
+    ends = sorted((abs(difference.low), abs(difference.high)))
+    near, far = (f"{end:.{difference.decimals()}f}" for end in ends)
+    return f"{fact}: {memory} {effect} the observability gap by {size} [{near}, {far}]."
 
 
 def pomdp_sentence(table: GapBias, memory_free: AgentRow, agent: AgentRow) -> str:
@@ -76,22 +82,27 @@ def pomdp_sentence(table: GapBias, memory_free: AgentRow, agent: AgentRow) -> st
     difference = table.difference("pomdp", agent.agent, memory_free.agent)
     if not difference.exists:
         return f"{fact}."
+    if difference.is_zero:
+        return f"{fact}, with no difference in any seed."
     if difference.excludes_zero:
-        return f"{fact}, a difference of {difference.value:+.2f} {_ends(difference)}."
+        few = _few_seeds(memory_free, agent)
+        return f"{fact}, a difference of {signed(difference)}{few}."
     return f"{fact}; the interval of the difference {_ends(difference)} contains zero."
 
 
 def bias_sentence(table: GapBias, memory_free: AgentRow, agent: AgentRow) -> str:
     """What memory costs where it is not needed."""
+    place = f"On the MDP, where memory is not needed, {agent.agent}"
+    if agent.bias.is_zero:
+        return f"{place} earns what the memory-free agent does, in every seed."
     effect = "costs" if agent.bias.value < 0 else "adds"
-    fact = (
-        f"On the MDP, where memory is not needed, {agent.agent} {effect} "
-        f"{abs(agent.bias.value):.2f} against the memory-free agent"
-    )
+    size = f"{abs(agent.bias.value):.{agent.bias.decimals()}f}"
+    fact = f"{place} {effect} {size} against the memory-free agent"
     if not agent.bias.exists:
         return f"{fact}."
     if agent.bias.excludes_zero:
-        return f"{fact} (bias {_ends(agent.bias)})."
+        few = _few_seeds(memory_free, agent)
+        return f"{fact}{few} (bias {_ends(agent.bias)})."
     return f"{fact}, which is within the noise (bias {_ends(agent.bias)} contains zero)."
 
 
@@ -99,9 +110,16 @@ SENTENCES = {"gap": gap_sentence, "pomdp": pomdp_sentence, "bias": bias_sentence
 """The findings of a report, in their order: number of the table -> who writes its sentence."""
 
 
+def _few_seeds(memory_free: AgentRow, agent: AgentRow) -> str:
+    """Of which seeds a finding is, where they are too few to say more; empty where not."""
+    if min(memory_free.coverage, agent.coverage) >= TRUSTED_COVERAGE:
+        return ""
+    return f" over these {min(memory_free.seeds, agent.seeds)} seeds"
+
+
 def _ends(interval: Interval) -> str:
-    """An interval as a report writes it."""
-    return f"[{interval.low:+.2f}, {interval.high:+.2f}]"
+    """The ends of an interval as a report writes them."""
+    return signed(interval).partition(" ")[2]
 
 
 def coverage_sentence(table: GapBias) -> str:

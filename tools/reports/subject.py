@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from arcade_torch.agents.config import TrainConfig
@@ -10,7 +10,7 @@ from arcade_torch.tools.comparable import Runs, listed
 from arcade_torch.tools.errors import one_line
 from arcade_torch.tools.figures.style import TWIN_NAMES
 from arcade_torch.tools.imports import ImportRefusedError, import_again
-from arcade_torch.tools.measures.bootstrap import measured_coverage
+from arcade_torch.tools.measures.bootstrap import Interval, measured_coverage
 from arcade_torch.tools.measures.gap_bias.measure import TWINS
 from arcade_torch.tools.measures.gap_bias.pairs import Pair, Task, pair_rows, pairs
 from arcade_torch.tools.runs import Run
@@ -30,11 +30,11 @@ def subject_section(
     """
     scores = runs.scores(metric)
     table = pairs(scores, subject)
-    tasks = dict.fromkeys(
-        (score.game, score.observability)
-        for score in scores
-        if score.agent == subject and score.observability in TWINS
-    )
+    tasks = dict[Task, bool]()  # of any agent: whether the subject has it
+    for score in scores:
+        if score.observability in TWINS:
+            task = (score.game, score.observability)
+            tasks[task] = tasks.get(task, False) or score.agent == subject
     folder.keep_table(f"differences_{metric}.csv", pair_rows(table, subject))
     others = list(dict.fromkeys(pair.other for pair in table))
     rows: dict[tuple[str, str], dict[str, Any]] = {}
@@ -60,7 +60,7 @@ def subject_section(
         "others": others,
         "rows": list(rows.values()),
         "sentences": sentences,
-        "shorter": _shorter_means(table, others, tasks),
+        "shorter": _shorter_means(table, subject, others, tasks),
         "costs": cost_rows,
         "trouble": trouble,
     }
@@ -76,15 +76,22 @@ def _first_of_tasks(table: Sequence[Pair], twin: str) -> list[Pair]:
 
 
 def _shorter_means(
-    table: Sequence[Pair], others: Sequence[str], tasks: Iterable[Task]
+    table: Sequence[Pair], subject: str, others: Sequence[str], tasks: Mapping[Task, bool]
 ) -> list[str]:
-    """Sentences on the agents whose means are over fewer tasks than the subject has."""
+    """Sentences on the agents whose means are over fewer tasks than others have; ``tasks`` says
+    which the subject has.
+    """
     sentences = []
+    missing = _names(task for task, is_there in tasks.items() if not is_there)
+    if missing:
+        sentences.append(
+            f"{subject} has no finished run on {listed(missing)}: all means are of the other tasks."
+        )
     for other in others:
         present = {(pair.game, pair.twin) for pair in table if pair.other == other}
-        missing = [
-            f"{game} {TWIN_NAMES[twin]}" for game, twin in tasks if (game, twin) not in present
-        ]
+        missing = _names(
+            task for task, is_there in tasks.items() if is_there and task not in present
+        )
         if missing:
             sentences.append(
                 f"{other} has no finished run on {listed(missing)}: its means are of the other "
@@ -93,13 +100,18 @@ def _shorter_means(
     return sentences
 
 
+def _names(tasks: Iterable[Task]) -> list[str]:
+    """Tasks as a page calls them."""
+    return [f"{game} {TWIN_NAMES[twin]}" for game, twin in tasks]
+
+
 def subject_sentence(
-    table: Sequence[Pair], subject: str, other: str, of_subject: Iterable[Task]
+    table: Sequence[Pair], subject: str, other: str, of_study: Iterable[Task]
 ) -> str:
     """What one agent earns against another where something has to be remembered, and where not;
-    ``of_subject`` are the tasks of the one.
+    ``of_study`` are the tasks that any agent has.
     """
-    counts = Counter(twin for _, twin in of_subject)
+    counts = Counter(twin for _, twin in of_study)
     clauses = []
     for twin, place in (("partial", "On the POMDP"), ("full", "on the MDP")):
         of_twin = [pair for pair in table if (pair.twin, pair.other) == (twin, other)]
@@ -123,15 +135,22 @@ def _verdict(pair: Pair, tasks: int, subject: str) -> str:
         return f"{fact}, since the score of a run is no number"
     if not difference.exists:
         return f"{fact}, with a single seed, which says nothing about others"
-    if difference.low == difference.high == 0:
+    if difference.is_zero:
         return f"{fact}, with no difference in any seed"
-    ends = f"{difference.value:+.2f} [{difference.low:+.2f}, {difference.high:+.2f}]"
+    ends = signed(difference)
     if not difference.excludes_zero:
         return f"{fact}: {ends} contains zero, so {pair.seeds} seeds do not settle it"
     seeds = (pair.seeds,) * tasks
     trusted = measured_coverage(seeds, seeds) >= TRUSTED_COVERAGE
     place = "ahead" if difference.value > 0 else "behind"
     return f"{fact}: {place} by {ends}" + ("" if trusted else f" over these {pair.seeds} seeds")
+
+
+def signed(difference: Interval) -> str:
+    """A difference and its interval as a sentence writes them."""
+    decimals = difference.decimals()
+    value, low, high = (f"{number:+.{decimals}f}" for number in difference)
+    return f"{value} [{low}, {high}]"
 
 
 def costs(runs: Runs) -> tuple[list[dict[str, Any]], str]:

@@ -23,7 +23,7 @@ from arcade_torch.models.gru import GRU
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench.memory_tests import TESTS
 from arcade_torch.tools.cards import measure, reach
-from arcade_torch.tools.cards.page import findings, page, ratios
+from arcade_torch.tools.cards.page import findings, page, ratios, reach_text
 from arcade_torch.tools.cards.study import GAMES, card_study, study_part
 from arcade_torch.tools.studies.folder import StudyFolder
 from tests.tools.fabricated import write_study
@@ -149,6 +149,48 @@ def test_a_ratio_is_its_time_over_that_of_the_rival() -> None:
     }
     card = {"name": "a", "speed": {"us_a_step": rows}}
     assert ratios(card) == {"gru": {"acting_us": 1.5, "learning_us": 0.25}}
+
+
+def lru_card() -> dict[str, Any]:
+    """The card of a built-in memory that is on file."""
+    found = Path(__file__).parents[3] / "results/cards/lru.json"
+    values: dict[str, Any] = json.loads(found.read_text())
+    return values
+
+
+@pytest.mark.parametrize(
+    ("gap", "seeds", "end"),
+    [
+        ([0.2, 0.1, 0.3], 3, "0.20 [0.10, 0.30] of normalised return."),
+        (
+            [0.02, -0.1, 0.1],
+            3,
+            "0.02 of normalised return, but the interval [-0.10, 0.10] contains zero, so 3 seeds "
+            "do not settle it.",
+        ),
+        ([0.2, None, None], 1, "0.20, with a single seed, which says nothing about others."),
+        ([0.002, 0.001, 0.003], 3, "0.002 [0.001, 0.003] of normalised return."),
+    ],
+)
+def test_the_gap_of_a_card_is_claimed_only_where_its_interval_allows(
+    gap: list[float | None], seeds: int, end: str
+) -> None:
+    """Before: it was, of one seed and of an interval around zero."""
+    said = findings(lru_card() | {"study": {"gap": gap, "seeds": seeds}})[-1]
+    assert said == f"Partial observability costs agents with it {end}"
+
+
+def test_the_reach_of_a_card_is_said_as_it_was_measured() -> None:
+    """Before: SHM's gradient was "at least a tenth up to 119 steps back", which it is at a few of
+    them, and where it was one at the last step that was looked at, the page said up to that.
+    """
+    norms = [1.0, 0.05, 0.2, 0.02, 0.02]
+    card = lru_card() | {"reach": {"norms": norms, "tenth": 2, "hundredth": 4}}
+    assert "a tenth for the last time 2 steps back, a hundredth 4 steps or more back" in page(card)
+    assert reach_text(card, "hundredth") == "4 steps or more"
+    assert reach_text(card, "tenth") == "2 steps"
+    card["reach"]["tenth"] = 1
+    assert reach_text(card, "tenth") == "1 step"
 
 
 def test_without_results_on_file_the_tests_are_trained(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,0 +1,116 @@
+"""Sentences of a report at the edges: equal returns, gaps below zero, differences next to zero."""
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import get_args
+
+from arcade_torch.tools import gap_and_bias, report
+from arcade_torch.tools.measures.bootstrap import Interval
+from arcade_torch.tools.measures.gap_bias.pairs import pairs
+from arcade_torch.tools.reports import Part, findings
+from arcade_torch.tools.reports.subject import subject_sentence
+from arcade_torch.tools.runs import Score
+from tests.tools.fabricated import small_study, write_study
+
+
+def two_agents(**returns: Sequence[float]) -> list[Score]:
+    """Scores with ``agent_twin=`` of one game, a seed each."""
+    made = []
+    for name, values in returns.items():
+        agent, twin = name.split("_")
+        for seed, value in enumerate(values):
+            made.append(Score(agent, "CartPoleEasy", twin, seed, value))
+    return made
+
+
+def test_the_same_returns_are_no_difference_whatever_the_number_of_seeds() -> None:
+    """Before: the mean of three times .7 is not .7, so an agent with one seed more was behind, by
+    -0.00 [-0.00, -0.00].
+    """
+    scores = two_agents(
+        gru_full=[0.7] * 3, gru_partial=[0.7] * 3, mlp_full=[0.7] * 2, mlp_partial=[0.7] * 2
+    )
+    both = pairs(scores, "gru", draws=50)
+    assert [pair.difference for pair in both] == [Interval(0.0, 0.0, 0.0)] * len(both)
+    made = gap_and_bias(scores, draws=50)
+    assert not made.difference("gap", "mlp", "gru").excludes_zero
+    said = {name: findings.score_sentence(made, name, "gru") for name in findings.SENTENCES}
+    assert "the gap is the same in every seed" in said["gap"]
+    assert said["pomdp"].endswith("the memory-free agent 0.70, with no difference in any seed.")
+    assert said["bias"].endswith("gru earns what the memory-free agent does, in every seed.")
+
+
+def test_a_gap_below_zero_becomes_lower_or_higher() -> None:
+    """Before: memory "widened" a gap of -0.40 to one of 0.00."""
+    six = [0.0, 0.01, 0.02, 0.03, 0.04, 0.05]
+
+    def said(mlp: float, lru: float, spread: Sequence[float] = six) -> str:
+        returns = {
+            "lru_full": [0.5] * 6,
+            "lru_partial": [0.5 - lru - 0.025 + more for more in spread],
+            "mlp_full": [0.5] * 6,
+            "mlp_partial": [0.5 - mlp - 0.025 + more for more in spread],
+        }
+        return findings.score_sentence(gap_and_bias(two_agents(**returns)), "gap", "lru")
+
+    assert "memory raises the observability gap by 0.40" in said(-0.4, 0.0)
+    assert "memory lowers the observability gap by 0.40" in said(-0.1, -0.5)
+    assert "memory narrows the observability gap by 0.40" in said(0.5, 0.1)
+    assert "memory widens the observability gap by 0.40" in said(0.1, 0.5)
+    wide = [10 * more for more in six]
+    assert "with memory the gap is 0.10 lower, but" in said(-0.4, -0.5, wide)
+    assert "with memory the gap is 0.10 higher, but" in said(-0.5, -0.4, wide)
+    assert "with memory the gap is 0.10 smaller, but" in said(0.5, 0.4, wide)
+
+
+def test_an_interval_that_excludes_zero_is_seen_to() -> None:
+    """Before: an agent was ahead by +0.00 [+0.00, +0.00]."""
+    near = [0.5, 0.501, 0.502, 0.503, 0.504, 0.505]
+    far = [value + 0.003 for value in near]
+    scores = two_agents(gru_full=far, gru_partial=far, mlp_full=near, mlp_partial=near)
+    made = gap_and_bias(scores)
+    pomdp = findings.score_sentence(made, "pomdp", "gru")
+    bias = findings.score_sentence(made, "bias", "gru")
+    headline = subject_sentence(pairs(scores, "gru"), "gru", "mlp", [("CartPoleEasy", "full")])
+    for sentence in (pomdp, bias, headline):
+        assert "+0.003" in sentence or "adds 0.003" in sentence
+        assert re.search(r"\[\+0\.00[1-9], \+0\.00[1-9]\]", sentence), sentence
+
+
+def test_of_few_seeds_every_finding_is_of_these_seeds() -> None:
+    """Before: only the gap was; two seeds were enough for what memory adds."""
+    few = two_agents(
+        gru_full=[0.8, 0.82],
+        gru_partial=[0.8, 0.81],
+        mlp_full=[0.5, 0.51],
+        mlp_partial=[0.2, 0.21],
+    )
+    many = two_agents(
+        gru_full=[0.8, 0.82] * 4,
+        gru_partial=[0.8, 0.81] * 4,
+        mlp_full=[0.5, 0.51] * 4,
+        mlp_partial=[0.2, 0.21] * 4,
+    )
+    for name in findings.SENTENCES:
+        assert "over these 2 seeds" in findings.score_sentence(gap_and_bias(few), name, "gru")
+        assert "over these" not in findings.score_sentence(gap_and_bias(many), name, "gru")
+
+
+def test_the_highest_of_a_row_is_bold_beside_one_that_is_no_number(tmp_path: Path) -> None:
+    """Before: a NaN that came first was the largest, and nothing was bold."""
+    games = ["MineSweeperEasy", "CartPoleEasy", "CountRecallEasy"]
+    study = small_study(games=games)
+    folder = write_study(tmp_path, study)
+    for run in study.runs():
+        if (run.game, run.memory) == ("CartPoleEasy", "mingru"):
+            file = folder.run(run).path / "eval.json"
+            changes = {"mean": math.nan, "returns": [math.nan, 0.5]}
+            file.write_text(json.dumps(json.loads(file.read_text()) | changes))
+    page = report(tmp_path, skip=get_args(Part)).read_text()
+    rows = re.findall(r"CartPoleEasy</a>(.*?)</tr>", page)
+    assert len(rows) == 2
+    for row in rows:
+        assert re.search(r'heat".*nan</td><td class="heat best"', row), row
