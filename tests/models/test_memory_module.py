@@ -382,3 +382,24 @@ def test_start_flags_may_be_of_any_type(dtype):
     with set_recurrent_mode(True):
         given = module(steps.clone())["y"]
         assert torch.equal(given, module(steps.set("is_init", flags.bool()))["y"])
+
+
+@pytest.mark.parametrize("name", memory_names())
+def test_an_env_without_a_batch_is_read_step_by_step_as_a_sequence(name):
+    torch.manual_seed(0)
+    module = MemoryModule(make_memory(name, 3, 8), in_key="embed", out_key="out")
+    x = torch.randn(5, 3)
+    is_init = (torch.arange(5) % 3 == 0).unsqueeze(-1)
+    state = TensorDict()
+    acted = []
+    for t in range(5):
+        step = TensorDict({"embed": x[t], "is_init": is_init[t]}).update(state)
+        module(step)
+        state = step.get("next", TensorDict())
+        acted.append(step["out"])
+    rows = TensorDict({"embed": x[:1], "is_init": is_init[:1]}, [1])
+    module(rows)
+    for key in module.state_keys:
+        assert step["next", *key].shape == rows["next", *key].shape[1:]
+    sequence, _ = module.memory(x[None], module.memory.initial_state(1), is_init.T)
+    torch.testing.assert_close(torch.stack(acted), sequence[0], atol=1e-5, rtol=1e-4)
