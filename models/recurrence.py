@@ -170,7 +170,9 @@ class Recurrence:
         if writes_states:
             for key, path in self._paths.items():
                 value = after.get(path)
-                tensordict.set(("next", *key), value.reshape(*shape, *value.shape[len(flat) :]))
+                of_one = value.shape[len(flat) :]
+                # as a tuple: of one env without a batch, a state that is a number has shape []
+                tensordict.set(("next", *key), value.reshape((*shape, *of_one)))
         return y.reshape(*shape, y.shape[-1])  # type: ignore[no-any-return]
 
     def make_primer(self, memory: nn.Module) -> "TensorDictPrimer":

@@ -382,3 +382,69 @@ def test_start_flags_may_be_of_any_type(dtype):
     with set_recurrent_mode(True):
         given = module(steps.clone())["y"]
         assert torch.equal(given, module(steps.set("is_init", flags.bool()))["y"])
+
+
+@pytest.mark.parametrize("name", memory_names())
+def test_an_env_without_a_batch_is_read_step_by_step_as_a_sequence(name):
+    torch.manual_seed(0)
+    module = MemoryModule(make_memory(name, 3, 8), in_key="embed", out_key="out")
+    x = torch.randn(5, 3)
+    is_init = (torch.arange(5) % 3 == 0).unsqueeze(-1)
+    state = TensorDict()
+    acted = []
+    for t in range(5):
+        step = TensorDict({"embed": x[t], "is_init": is_init[t]}).update(state)
+        module(step)
+        state = step.get("next", TensorDict())
+        acted.append(step["out"])
+    rows = TensorDict({"embed": x[:1], "is_init": is_init[:1]}, [1])
+    module(rows)
+    for key in module.state_keys:
+        assert step["next", *key].shape == rows["next", *key].shape[1:]
+    sequence, _ = module.memory(x[None], module.memory.initial_state(1), is_init.T)
+    torch.testing.assert_close(torch.stack(acted), sequence[0], atol=1e-5, rtol=1e-4)
+
+
+def test_gae_is_exact_when_the_weights_have_moved_if_it_is_shifted_alone():
+    torch.manual_seed(0)
+    critic = TensorDictSequential(
+        MemoryModule(make_memory("mingru", 3, 8), in_key="observation", out_key="remembered"),
+        TensorDictModule(nn.Linear(8, 1), in_keys=["remembered"], out_keys=["state_value"]),
+    )
+    act = TensorDictModule(
+        lambda x: torch.zeros(x.shape[:-1], dtype=torch.int64), ["observation"], ["action"]
+    )
+    data = make_env(critic).rollout(
+        16, TensorDictSequential(critic, act), break_when_any_done=False
+    )
+    with torch.no_grad():
+        for weight in critic.parameters():
+            weight += 0.3 * torch.randn_like(weight)
+    kept = ["observation", "is_init", "done", "terminated", "truncated", *critic[0].state_keys]
+    # step by step: every next observation behind the state that these weights lead to
+    advantage = torch.zeros(4, 1)
+    deltas = []
+    state = data[:, 0].select(*critic[0].state_keys)
+    for t in range(16):
+        with torch.no_grad():
+            step = critic(data[:, t].select("observation", "is_init").update(state))
+            state = step["next"].select(*critic[0].state_keys)
+            following = data[:, t]["next"].select("observation").update(state)
+            following["is_init"] = torch.zeros(4, 1, dtype=torch.bool)
+            after = critic(following)["state_value"] * ~data["next", "terminated"][:, t]
+            deltas.append(data["next", "reward"][:, t] + 0.9 * after - step["state_value"])
+    expected = []
+    for t in reversed(range(16)):
+        advantage = deltas[t] + 0.72 * advantage * ~data["next", "done"][:, t]
+        expected.insert(0, advantage)
+    off = {}
+    for shifted in (True, False):
+        batch = data.select(*kept, "next").exclude(("next", "state_value"))
+        gae = GAE(gamma=0.9, lmbda=0.8, value_network=critic, shifted=shifted, shifted_budget=8)
+        with set_recurrent_mode(True):
+            gae(batch)
+        error = (batch["advantage"] - torch.stack(expected, 1)).abs()
+        error[:, -1][data["is_init"][:, -1]] = 0  # shifted is off there, too
+        off[shifted] = float(error.max())
+    assert off[True] < 1e-5
+    assert off[False] > 1e-2
