@@ -15,7 +15,7 @@ import pytest
 from arcade_torch.tools.board import check as checks
 from arcade_torch.tools.board import submit as submits
 from arcade_torch.tools.board.check import CheckRecord, check, read_record, write_record
-from arcade_torch.tools.board.entry import BoardRun, EntryRefusedError
+from arcade_torch.tools.board.entry import BoardRun, EntryRefusedError, entry_of
 from arcade_torch.tools.board.evaluation import Evaluator, Played
 from arcade_torch.tools.board.submit import submit
 from tests.tools.board.boards import GAME, SHORT, WORDS, plain_entry, write_pair, write_run
@@ -222,6 +222,56 @@ def test_agents_of_some_games_may_be_smaller_than_the_largest(
     assert check(write(tmp_path, honest), runs, protocol=SHORT).equal == 4
 
 
+def test_a_part_of_an_entry_need_not_have_its_largest_agent(
+    runs: Path, honest: Plain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play = checks.Evaluator.play
+
+    def play_smaller(self: Any, checkpoint: Path, twin: str) -> Any:
+        return replace(play(self, checkpoint, twin), parameters=honest["parameters"] - 100)
+
+    monkeypatch.setattr(checks.Evaluator, "play", play_smaller)
+    assert check(write(tmp_path, honest), runs, 1, SHORT).equal == 1
+    assert "is the largest of the runs" in refusal(write(tmp_path, honest), runs)
+
+
+def test_the_folder_of_a_run_is_the_one_with_its_weights_then_one_that_was_trained(
+    honest: Plain, tmp_path: Path
+) -> None:
+    """Beside them lie runs of the same settings that stopped, and a damaged one."""
+    entry = entry_of(honest)
+    run = entry.runs[0]
+
+    def copy_of(name: str) -> Path:
+        return write_run(tmp_path / name, observability=run.twin, seed=run.seed)
+
+    stopped, other = copy_of("a"), copy_of("b")
+    shutil.rmtree(next(stopped.glob("checkpoints/frames-*")))
+    weights = next(other.rglob("weights.safetensors"))
+    weights.write_bytes(weights.read_bytes()[:-1] + b"x")
+    (copy_of("c") / "config.json").write_text("{")
+    assert checks.find_folders(entry, [run], tmp_path) == {run.cell: other}
+    own = copy_of("d")
+    assert checks.find_folders(entry, [run], tmp_path) == {run.cell: own}
+
+
+def test_which_part_is_drawn_cannot_be_foreseen(
+    runs: Path, honest: Plain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever knows it needs to be honest in that part alone."""
+    played = set()
+
+    def play_none(entry: Any, chosen: Any, *rest: Any) -> Any:
+        played.add(tuple(run.cell for run in chosen))
+        return chosen, 0
+
+    monkeypatch.setattr(checks, "_play_again", play_none)
+    for _ in range(12):
+        random.seed(0)
+        check(write(tmp_path, honest), runs, 2, SHORT)
+    assert len(played) > 1
+
+
 def test_other_weights_are_refused_before_they_are_loaded(
     honest: Plain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -393,7 +443,21 @@ def test_runs_without_the_checkpoint_of_their_end_are_refused_before_any_is_eval
 ) -> None:
     write_pair(tmp_path)
     last = max(tmp_path.glob("*/checkpoints/frames-*"))
-    shutil.rmtree(last)
+    last.rename(last.with_name("frames-000000000256"))  # an earlier one is no agent of the end
     monkeypatch.setattr(submits.Evaluator, "play", no_episodes)
     with pytest.raises(EntryRefusedError, match="has no checkpoint frames-"):
+        submit([tmp_path], WORDS, protocol=SHORT)
+
+
+def test_an_agent_that_turns_out_to_read_the_state_makes_no_entry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_pair(tmp_path)
+    read = iter((("pixels",), ("pixels", "state")))  # one of the runs alone
+
+    def play(self: Any, checkpoint: Path, twin: str) -> Played:
+        return Played(0.0, 0.0, 0.0, "0" * 64, 1, 1, next(read))
+
+    monkeypatch.setattr(submits.Evaluator, "play", play)
+    with pytest.raises(EntryRefusedError, match="privileged observation in training: 'state'"):
         submit([tmp_path], WORDS, protocol=SHORT)
