@@ -128,6 +128,18 @@ def test_advantages_do_not_depend_on_how_many_rows_are_read_at_once_and_rows_kee
     torch.testing.assert_close(loss(whole[rows])["entropy"], loss(whole[rows.flip(0)])["entropy"])
 
 
+def test_an_estimate_by_given_parameters_is_that_of_a_critic_that_has_them():
+    batch = with_two_states(stream(3, 7, seed=2)).sequences()
+    critic, other = (toy_actor_critic(seed).critic for seed in (3, 4))
+    estimator, wanted = SequenceGAE(critic, GAMMA, LAM), SequenceGAE(other, GAMMA, LAM)
+    own = estimator(batch.clone())
+    found = estimator(batch.clone(), params=TensorDict.from_module(other))
+    for key in ESTIMATES:
+        assert torch.equal(found[key], wanted(batch.clone())[key])
+        assert torch.equal(estimator(batch.clone())[key], own[key])  # it has its own again
+    assert not torch.equal(found["advantage"], own["advantage"])
+
+
 def test_a_flat_sequence_gets_the_advantages_and_the_losses_of_a_batch_of_one():
     _, batch, loss = acted(with_two_states(stream(1, 8, seed=3)), "stock", shift=0.4)
     whole, flat = loss.value_estimator(batch.clone()), loss.value_estimator(batch[0].clone())

@@ -12,11 +12,12 @@ from typing import Any
 
 import pytest
 
+from arcade_torch.agents import evaluate, load
 from arcade_torch.tools.board import check as checks
 from arcade_torch.tools.board import submit as submits
 from arcade_torch.tools.board.check import CheckRecord, check, read_record, write_record
 from arcade_torch.tools.board.entry import BoardRun, EntryRefusedError, entry_of
-from arcade_torch.tools.board.evaluation import Evaluator, Played
+from arcade_torch.tools.board.evaluation import Evaluator, Played, digest
 from arcade_torch.tools.board.submit import submit
 from tests.tools.board.boards import GAME, SHORT, WORDS, plain_entry, write_pair, write_run
 
@@ -84,6 +85,29 @@ def test_an_entry_says_all_that_the_protocol_asks_for(honest: Plain) -> None:
     assert honest["parameters"] > 0 and honest["state_bytes"] > 0 and honest["frames"] == 512
     assert {"torch", "jax", "commit", "processor"} <= set(honest["made_with"])
     assert honest["observations"]["acting"] == ["is_init", "last_action", "pixels"]
+    assert {run["seconds"] for run in honest["runs"]} == {2.0}
+
+
+def test_an_agent_plays_the_episodes_of_the_protocol(
+    runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An agent that was not trained plays all seeds alike: its score does not tell which."""
+    checkpoint = next(runs.glob(f"{GAME}-partial-mingru-1/checkpoints/frames-*"))
+    results = list[Any]()
+
+    def evaluate_once(agent: Any, twin: str, seed: int, env: Any) -> Any:
+        assert (twin, seed, env.num_envs) == ("full", SHORT.seed, SHORT.episodes)
+        results.append(evaluate(agent, "full", seed=seed, env=env))
+        return results[0]
+
+    monkeypatch.setattr("arcade_torch.agents.evaluation.evaluate", evaluate_once)
+    found = Evaluator(SHORT).play(checkpoint, "full")  # trained on the other twin
+    (result,) = results
+    assert found.returns_sha256 == digest(result.returns, result.lengths)
+    assert found.score == pytest.approx(float(result.returns.mean()))
+    assert found.half_width == pytest.approx(result.half_width)
+    state = load(checkpoint).initial_state(1).values(include_nested=True, leaves_only=True)
+    assert found.state_bytes == sum(4 * part.numel() for part in state) > 0
 
 
 def set_score(plain: Plain) -> None:
@@ -141,12 +165,28 @@ def show_the_state(plain: Plain) -> None:
     plain["observations"]["training"].append("state")
 
 
+def play_by_the_state(plain: Plain) -> None:
+    plain["observations"]["acting"].append("state")
+
+
 def hide_the_observations(plain: Plain) -> None:
     plain["observations"] = {"acting": ["pixels"]}
 
 
 def set_rules(plain: Plain) -> None:
     plain["environments"]["rules"] = "reference"
+
+
+def set_size(plain: Plain) -> None:
+    plain["environments"]["obs_size"] = 256
+
+
+def set_memory(plain: Plain) -> None:
+    plain["memory"] = "lru"
+
+
+def set_algorithm(plain: Plain) -> None:
+    plain["algorithm"] = "ppo"
 
 
 def set_options(plain: Plain) -> None:
@@ -188,8 +228,12 @@ FALSIFIED: dict[Callable[[Plain], None], str] = {
     set_game: "the game PairsEasy-v0 is none of this package, and the board compares agents on",
     set_protocol: "protocol is 2; the protocol of this version demands 1",
     show_the_state: "privileged observation in training: 'state'",
+    play_by_the_state: "privileged observation in acting: 'state'",
     hide_the_observations: "observations.training does not say what the agent reads",
     set_rules: "environments.rules is reference",
+    set_size: "environments.obs_size is 256",
+    set_memory: "memory is 'mingru', the entry says 'lru'",
+    set_algorithm: "algorithm is 'pqn', the entry says 'ppo'",
     set_options: "env_options make another task",
     train_the_pomdp_on_the_mdp: "observability is 'full', the entry says 'partial'",
     set_gamma: "differs in pqn.gamma (0.99 != 0.5)",
@@ -461,3 +505,23 @@ def test_an_agent_that_turns_out_to_read_the_state_makes_no_entry(
     monkeypatch.setattr(submits.Evaluator, "play", play)
     with pytest.raises(EntryRefusedError, match="privileged observation in training: 'state'"):
         submit([tmp_path], WORDS, protocol=SHORT)
+
+
+def test_an_entry_of_several_games_says_the_largest_of_each_and_keeps_the_settings_of_every_game(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_pair(tmp_path)
+    write_pair(tmp_path, env="CountRecallEasy-v0", pqn={"gamma": 0.5})
+    sizes = iter((1, 4, 3, 2))
+
+    def play(self: Any, checkpoint: Path, twin: str) -> Played:
+        size = next(sizes)
+        read = ("pixels", "last_action") if size == 4 else ("pixels",)
+        return Played(0.0, 0.0, 0.0, "0" * 64, size, 10 * size, read)
+
+    monkeypatch.setattr(submits.Evaluator, "play", play)
+    entry = submit([tmp_path], WORDS, protocol=SHORT)
+    assert (entry.parameters, entry.state_bytes) == (4, 40)
+    assert entry.observations["acting"] == ["last_action", "pixels"]
+    gammas = {run.game: entry.config(run).pqn.gamma for run in entry.runs}
+    assert gammas == {GAME: 0.99, "CountRecallEasy-v0": 0.5}
