@@ -286,8 +286,13 @@ def test_a_critic_whose_memory_did_not_run_while_collecting_is_named():
     network = toy_actor_critic(3)
     batch = with_two_states(stream(4, 9, seed=3)).sequences()
     del batch["initial_state", "memory", "critic"]
-    with pytest.raises(ValueError, match=r"initial_state must hold .*critic.*while collecting"):
+    refused = r"^initial_state must hold .*critic.*while collecting[^\n]*$"
+    with pytest.raises(ValueError, match=refused):
         SequenceGAE(network.critic)(batch)
+    for key in ("advantage", "value_target", "state_value", "action_log_prob"):
+        batch[key] = torch.zeros(4, 9)  # estimates of one's own, which take no pass of the critic
+    with pytest.raises(ValueError, match=refused):
+        PPOLoss(make_actor(network.actor), network.critic)(batch)
 
 
 def test_torchrls_losses_train_actor_and_critic_of_one_tower():
@@ -323,6 +328,15 @@ def test_torchrls_losses_train_actor_and_critic_of_one_tower():
         parameter.grad is not None and parameter.grad.any()
         for parameter in network.actor.block.parameters()
     )
+
+
+def test_a_stored_value_is_never_taken_for_that_of_a_critic_that_writes_none():
+    """It has no gradient, and the critic would not learn."""
+    network, batch, loss = acted(with_two_states(stream(3, 6, seed=5)))
+    batch = loss.value_estimator(batch)
+    critic = toy_network(3, 1, out_key="guess", state_key=("memory", "critic"))
+    with pytest.raises(KeyError, match="state_value"):
+        PPOLoss(make_actor(network.actor), critic)(batch)
 
 
 def test_a_loss_without_a_critic_needs_an_actor_that_writes_the_value():
