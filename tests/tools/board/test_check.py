@@ -10,9 +10,10 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from arcade_torch.agents import evaluate, load
+from arcade_torch.agents import EvalResult, evaluate, load
 from arcade_torch.tools.board import check as checks
 from arcade_torch.tools.board import submit as submits
 from arcade_torch.tools.board.check import CheckRecord, check, read_record, write_record
@@ -97,15 +98,16 @@ def test_an_agent_plays_the_episodes_of_the_protocol(
 
     def evaluate_once(agent: Any, twin: str, seed: int, env: Any) -> Any:
         assert (twin, seed, env.num_envs) == ("full", SHORT.seed, SHORT.episodes)
-        results.append(evaluate(agent, "full", seed=seed, env=env))
+        lengths = evaluate(agent, "full", seed=seed, env=env).lengths
+        results.append(EvalResult(np.array([0.0, 1.0, 1.0, 3.0], np.float32), lengths))
         return results[0]
 
     monkeypatch.setattr("arcade_torch.agents.evaluation.evaluate", evaluate_once)
     found = Evaluator(SHORT).play(checkpoint, "full")  # trained on the other twin
     (result,) = results
     assert found.returns_sha256 == digest(result.returns, result.lengths)
-    assert found.score == pytest.approx(float(result.returns.mean()))
-    assert found.half_width == pytest.approx(result.half_width)
+    assert found.score == 1.25 and found.std == pytest.approx(result.std) != 0
+    assert found.half_width == pytest.approx(3.182446 * np.std(result.returns, ddof=1) / 2)
     state = load(checkpoint).initial_state(1).values(include_nested=True, leaves_only=True)
     assert found.state_bytes == sum(4 * part.numel() for part in state) > 0
 
@@ -516,6 +518,7 @@ def test_an_entry_of_several_games_says_the_largest_of_each_and_keeps_the_settin
 
     def play(self: Any, checkpoint: Path, twin: str) -> Played:
         size = next(sizes)
+        assert f"-{twin}-" in str(checkpoint)
         read = ("pixels", "last_action") if size == 4 else ("pixels",)
         return Played(0.0, 0.0, 0.0, "0" * 64, size, 10 * size, read)
 
