@@ -267,19 +267,24 @@ def _rows(value: Tensor, index: Tensor) -> Tensor:
     return chosen.view(*index.shape, *value.shape[2:])
 
 
+def _check_states(first: TensorDictBase, inputs: NetworkInputs) -> None:
+    """Refuse an ``initial_state`` without what a network reads (ValueError)."""
+    missing = [key for key in inputs.state_keys if key not in first]
+    if missing:
+        raise ValueError(
+            f"initial_state must hold {missing[0]!r}, which a network of the loss reads: let it "
+            "run while collecting, TensorDictSequential(critic, actor); got "
+            f"{', '.join(map(str, first.keys()))}"
+        )
+
+
 def _add_state(out: TensorDict, batch: TensorDictBase, inputs: NetworkInputs) -> None:
     """Write ``initial_state``, the recurrent state before the first step."""
     if not inputs.state_keys:
         return
     first = _stored_state(batch)
     if first is not None:
-        missing = [key for key in inputs.state_keys if key not in first]
-        if missing:
-            raise ValueError(
-                f"initial_state must hold {missing[0]!r}, which a network of the loss reads: let "
-                "it run while collecting, TensorDictSequential(critic, actor); got "
-                f"{', '.join(map(str, first.keys()))}"
-            )
+        _check_states(first, inputs)
         out["initial_state"] = first.select(*inputs.state_keys).detach()
         return
 
@@ -422,6 +427,7 @@ def as_steps(batch: TensorDictBase, inputs: NetworkInputs, *keys: Key) -> Tensor
     for key in (*inputs.observation_keys, *keys):
         out[key] = entry(batch, key)
     if inputs.state_keys:
+        _check_states(batch["initial_state"], inputs)
         _begin_with(out, batch["initial_state"], inputs)
     return _with_flags(out, inputs)
 

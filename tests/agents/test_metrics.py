@@ -46,6 +46,11 @@ def test_the_score_of_a_step_matches_the_geometric_series():
     assert paper_score(grid, returns) == pytest.approx(1 - (1 - 2 / 101) ** 500, abs=1e-12)
 
 
+def test_the_axis_begins_at_frame_zero_whenever_the_first_episode_ended():
+    """A ramp over the second half of 1,000 points is followed (1 - alpha) / alpha points late."""
+    assert paper_score([500, 1000], [0.0, 1.0]) == pytest.approx(1 - 49.5 / 499.5, abs=1e-3)
+
+
 def test_beyond_the_history_the_curve_is_constant():
     assert paper_score([50, 100], [0.2, 0.2], max_frames=1000) == pytest.approx(0.2)
     late = paper_score([1, 100], [0.0, 1.0], max_frames=10_000)

@@ -128,6 +128,18 @@ def test_advantages_do_not_depend_on_how_many_rows_are_read_at_once_and_rows_kee
     torch.testing.assert_close(loss(whole[rows])["entropy"], loss(whole[rows.flip(0)])["entropy"])
 
 
+def test_an_estimate_by_given_parameters_is_that_of_a_critic_that_has_them():
+    batch = with_two_states(stream(3, 7, seed=2)).sequences()
+    critic, other = (toy_actor_critic(seed).critic for seed in (3, 4))
+    estimator, wanted = SequenceGAE(critic, GAMMA, LAM), SequenceGAE(other, GAMMA, LAM)
+    own = estimator(batch.clone())
+    found = estimator(batch.clone(), params=TensorDict.from_module(other))
+    for key in ESTIMATES:
+        assert torch.equal(found[key], wanted(batch.clone())[key])
+        assert torch.equal(estimator(batch.clone())[key], own[key])  # it has its own again
+    assert not torch.equal(found["advantage"], own["advantage"])
+
+
 def test_a_flat_sequence_gets_the_advantages_and_the_losses_of_a_batch_of_one():
     _, batch, loss = acted(with_two_states(stream(1, 8, seed=3)), "stock", shift=0.4)
     whole, flat = loss.value_estimator(batch.clone()), loss.value_estimator(batch[0].clone())
@@ -274,8 +286,13 @@ def test_a_critic_whose_memory_did_not_run_while_collecting_is_named():
     network = toy_actor_critic(3)
     batch = with_two_states(stream(4, 9, seed=3)).sequences()
     del batch["initial_state", "memory", "critic"]
-    with pytest.raises(ValueError, match=r"initial_state must hold .*critic.*while collecting"):
+    refused = r"^initial_state must hold .*critic.*while collecting[^\n]*$"
+    with pytest.raises(ValueError, match=refused):
         SequenceGAE(network.critic)(batch)
+    for key in ("advantage", "value_target", "state_value", "action_log_prob"):
+        batch[key] = torch.zeros(4, 9)  # estimates of one's own, which take no pass of the critic
+    with pytest.raises(ValueError, match=refused):
+        PPOLoss(make_actor(network.actor), network.critic)(batch)
 
 
 def test_torchrls_losses_train_actor_and_critic_of_one_tower():
@@ -311,6 +328,15 @@ def test_torchrls_losses_train_actor_and_critic_of_one_tower():
         parameter.grad is not None and parameter.grad.any()
         for parameter in network.actor.block.parameters()
     )
+
+
+def test_a_stored_value_is_never_taken_for_that_of_a_critic_that_writes_none():
+    """It has no gradient, and the critic would not learn."""
+    network, batch, loss = acted(with_two_states(stream(3, 6, seed=5)))
+    batch = loss.value_estimator(batch)
+    critic = toy_network(3, 1, out_key="guess", state_key=("memory", "critic"))
+    with pytest.raises(KeyError, match="state_value"):
+        PPOLoss(make_actor(network.actor), critic)(batch)
 
 
 def test_a_loss_without_a_critic_needs_an_actor_that_writes_the_value():

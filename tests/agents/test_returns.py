@@ -111,6 +111,15 @@ def test_float64_keeps_its_precision(estimate):
 
 
 @both
+def test_the_result_has_the_dtype_of_the_rewards(estimate):
+    reward, value, after, *flags = draw(1)
+    estimator = gae if estimate is advantages else returns
+    for dtype in (torch.float32, torch.bfloat16):
+        for values in ((value, after), (value.float(), after)):
+            assert estimator(reward.to(dtype), *values, *flags, 0.9, 0.8).dtype == dtype
+
+
+@both
 def test_lambda_zero_is_the_one_step_target(estimate):
     reward, value, after, terminated, truncated = draw(1)
     found = estimate(reward, value, after, terminated, truncated, 0.9, 0.0)

@@ -289,6 +289,8 @@ def test_weights_fit_every_layout(burn_in):
             "loss"
         ]
         torch.testing.assert_close(found, each * weight.view(shape)[..., burn_in:])
+        with_one_more = stock.clone().reshape(shape).set("priority_weight", weight.view(*shape, 1))
+        torch.testing.assert_close(loss()(with_one_more)["loss"], found)
     each = loss()(stock[1].clone())["loss"]
     assert each.shape == (left,)
     found = loss()(stock[1].clone().set("priority_weight", weight[1]))["loss"]

@@ -390,6 +390,24 @@ def test_a_run_has_threads_and_draws_of_its_own_and_gives_back_those_it_found(th
     assert torch.get_num_threads() == before and torch.equal(torch.get_rng_state(), draws)
 
 
+def test_everything_that_a_run_draws_goes_by_its_seed():
+    """Runs that share weights, actions, games or the order of minibatches are no two seeds."""
+    one, other = (trainer_module.Trainer(dataclasses.replace(CONFIG, seed=seed)) for seed in (0, 1))
+    states = [[t.random_state, t.shuffle.get_state()] for t in (one, other)]
+    weights_of = [torch.cat([p.flatten() for p in t.network.parameters()]) for t in (one, other)]
+    for mine, theirs in [*zip(*states, strict=True), weights_of]:
+        assert not torch.equal(mine, theirs)
+    other.random_state = one.random_state.clone()
+    windows = []
+    for trainer in (one, other):
+        trainer.collector._generator.manual_seed(0)  # the same actions in other games
+        with trainer._own_settings():
+            windows.append(trainer.collector.collect(random=True))
+        trainer.close()
+    assert torch.equal(windows[0]["action"], windows[1]["action"])
+    assert not torch.equal(windows[0]["pixels"], windows[1]["pixels"])
+
+
 def test_the_same_seed_gives_the_same_run_and_another_seed_another(whole, tmp_path):
     train(CONFIG, tmp_path / "same")
     assert_same_run(tmp_path / "same", whole[0])

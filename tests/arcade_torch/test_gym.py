@@ -316,6 +316,7 @@ def test_render_gives_the_frame_that_is_seen() -> None:
     envs.reset(seed=0)
     frames = envs.step(np.array([4, 0, 3]))[0]
     assert equal(np.stack(envs.render()), frames)
+    assert all(frame.flags.writeable for frame in envs.render())
     assert gymnasium.make(GAME, render_mode="rgb_array_list").reset()[0].shape == (128, 128, 3)
 
 

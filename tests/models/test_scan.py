@@ -141,6 +141,8 @@ def test_one_step_at_a_time_equals_one_call():
         h = linear_scan(a[:, t : t + 1], b[:, t : t + 1], start[:, t : t + 1], h)[:, 0]
         states.append(h)
     torch.testing.assert_close(torch.stack(states, 1), linear_scan(a, b, start, h0))
+    b0 = b[:, :1]
+    assert torch.equal(linear_scan(a[:, :1], b0).zero_() + b0, b0) and b0.any()  # b is the caller's
 
 
 @pytest.mark.parametrize(

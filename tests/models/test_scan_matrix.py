@@ -175,6 +175,43 @@ def test_with_stored_states_it_loses_the_states_of_its_episode_too(where):
         assert torch.equal(found[0, 7:], right[0, 7:]) and torch.equal(found[1], right[1])
 
 
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_a_state_that_is_not_finite_loses_its_episode_and_nothing_else(value):
+    steps, start, h0 = problem("gated delta", length=12, resets=0.0)
+    start[:, 7] = True
+    clean, clean_last = matrix_scan(steps, start, h0, chunk=5)
+    h0[0, 1, 2] = value
+    o, last = matrix_scan(steps, start, h0, chunk=5)
+    assert o[0, :7].isnan().all()
+    assert torch.equal(o[0, 7:], clean[0, 7:]) and torch.equal(o[1], clean[1])
+    assert torch.equal(last, clean_last)
+
+
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+@pytest.mark.parametrize("where", ["key", "value", "erase", "log_decay"])
+def test_an_episode_that_is_lost_at_the_end_loses_the_state_that_is_carried_on(where, value):
+    """The next call would take it for a good one."""
+    steps, start, h0 = problem("gated delta", length=12, resets=0.0)
+    start[:, 7] = True
+    clean, clean_last = matrix_scan(steps, start, h0, chunk=5)
+    given = getattr(steps, where).clone()
+    given[0, 9] = value
+    o, last = matrix_scan(steps._replace(**{where: given}), start, h0, chunk=5)
+    assert o[0, 9:].isnan().all() and last[0].isnan().all()
+    assert torch.equal(o[0, :9], clean[0, :9]) and torch.equal(last[1], clean_last[1])
+
+
+@pytest.mark.parametrize("kind", ["decay", "gated delta"])
+@pytest.mark.parametrize("chunk", [1, 5, 12])
+def test_a_decay_of_minus_infinity_forgets_everything_and_loses_nothing(kind, chunk):
+    steps, start, h0 = problem(kind, length=12, resets=0.0)
+    steps.log_decay[:, 4] = -torch.inf
+    o, last = matrix_scan(steps, start, h0, chunk=chunk)
+    looped, states = matrix_scan_loop(steps, start, h0)
+    torch.testing.assert_close(o, looped, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(last, states[:, -1], rtol=1e-12, atol=1e-12)
+
+
 def test_a_nan_in_the_state_does_not_come_through_a_start():
     steps, start, h0 = problem("gated delta", length=9)
     start[:, 0] = True

@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,14 @@ from arcade_torch.tools.commands import compare
 from arcade_torch.tools.figures.style import AGENT_COLOURS, agent_colours
 from arcade_torch.tools.measures.gap_bias.pairs import pairs
 from arcade_torch.tools.runs import Score
-from arcade_torch.tools.studies.budget import Budget, Size, Speed
+from arcade_torch.tools.studies.budget import (
+    REPORT_S,
+    START_S,
+    Budget,
+    Size,
+    Speed,
+    measure_speed,
+)
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study
 from tests.tools.fabricated import write_study
@@ -66,6 +74,53 @@ def test_games_and_seeds_are_left_out_before_runs_become_too_short() -> None:
     assert budget.fit(GAMES, 10, seeds=4).seeds == 4
     assert budget.fit(GAMES, 10, frames=100_000).frames == 100_000
     assert Budget(3, 64, SPEED).fit(GAMES, 10).frames >= 250_000
+
+
+def test_a_study_lasts_until_the_worker_with_the_most_runs_is_done() -> None:
+    one_round = Budget(3, 6, SPEED).minutes(games=1, seeds=1, frames=60_000)
+    for workers, rounds in ((64, 1), (5, 2), (4, 2), (2, 3), (1, 6)):
+        minutes = Budget(3, workers, SPEED).minutes(games=1, seeds=1, frames=60_000)
+        assert minutes == pytest.approx(rounds * one_round)
+
+
+def test_a_study_is_as_large_as_what_just_fits_and_never_longer_than_the_preset() -> None:
+    budget = Budget(agents=3, workers=2, speed=SPEED)
+    assert budget.fit(GAMES, 10, frames=78_000) == Size(GAMES[:2], 2, 78_000)
+    assert budget.fit(GAMES[:1], 240).seeds == 5  # one game is no reason for fewest seeds
+    assert budget.fit(GAMES, 100_000) == Size(GAMES, 5, 2_500_000)
+
+
+def test_the_speed_is_that_of_all_memories_and_a_busy_machine_starts_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """On a clock that the trainer moves; the process has a core half of the time."""
+    clock_s = [0.0]
+    frames_per_s = {"gru": 1_000, "mlp": 4_000}
+
+    class Timed:
+        def __init__(self, config: Any) -> None:
+            self.config = config
+            clock_s[0] += 1.0
+
+        def update(self) -> None:
+            frames = self.config.learner.frames_per_update
+            clock_s[0] += frames / frames_per_s[self.config.memory]
+
+        def warm_up(self) -> None:
+            pass
+
+        def close(self) -> None:
+            pass
+
+    clocks = SimpleNamespace(perf_counter=lambda: clock_s[0], process_time=lambda: clock_s[0] / 2)
+    monkeypatch.setattr("arcade_torch.agents.trainer.Trainer", Timed)
+    monkeypatch.setattr("arcade_torch.tools.studies.budget.time", clocks)
+    study = Study("speed", GAMES, ("gru", "mlp"), (0,), preset="smoke")
+    frames = study.config(study.runs()[0]).learner.frames_per_update
+    speed = measure_speed(study)
+    assert speed.frames_per_s == pytest.approx(2 / (1 / 1_000 + 1 / 4_000))
+    assert speed.start_s == pytest.approx(2 * START_S + 1.0 + frames / 4_000)
+    assert speed.report_s == pytest.approx(2 * REPORT_S)
 
 
 def test_the_study_is_about_the_memory_and_says_what_is_left_out(

@@ -10,13 +10,15 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
+from arcade_torch.agents import EvalResult, evaluate, load
 from arcade_torch.tools.board import check as checks
 from arcade_torch.tools.board import submit as submits
 from arcade_torch.tools.board.check import CheckRecord, check, read_record, write_record
-from arcade_torch.tools.board.entry import BoardRun, EntryRefusedError
-from arcade_torch.tools.board.evaluation import Evaluator, Played
+from arcade_torch.tools.board.entry import BoardRun, EntryRefusedError, entry_of
+from arcade_torch.tools.board.evaluation import Evaluator, Played, digest
 from arcade_torch.tools.board.submit import submit
 from tests.tools.board.boards import GAME, SHORT, WORDS, plain_entry, write_pair, write_run
 
@@ -84,6 +86,30 @@ def test_an_entry_says_all_that_the_protocol_asks_for(honest: Plain) -> None:
     assert honest["parameters"] > 0 and honest["state_bytes"] > 0 and honest["frames"] == 512
     assert {"torch", "jax", "commit", "processor"} <= set(honest["made_with"])
     assert honest["observations"]["acting"] == ["is_init", "last_action", "pixels"]
+    assert {run["seconds"] for run in honest["runs"]} == {2.0}
+
+
+def test_an_agent_plays_the_episodes_of_the_protocol(
+    runs: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An agent that was not trained plays all seeds alike: its score does not tell which."""
+    checkpoint = next(runs.glob(f"{GAME}-partial-mingru-1/checkpoints/frames-*"))
+    results = list[Any]()
+
+    def evaluate_once(agent: Any, twin: str, seed: int, env: Any) -> Any:
+        assert (twin, seed, env.num_envs) == ("full", SHORT.seed, SHORT.episodes)
+        lengths = evaluate(agent, "full", seed=seed, env=env).lengths
+        results.append(EvalResult(np.array([0.0, 1.0, 1.0, 3.0], np.float32), lengths))
+        return results[0]
+
+    monkeypatch.setattr("arcade_torch.agents.evaluation.evaluate", evaluate_once)
+    found = Evaluator(SHORT).play(checkpoint, "full")  # trained on the other twin
+    (result,) = results
+    assert found.returns_sha256 == digest(result.returns, result.lengths)
+    assert found.score == 1.25 and found.std == pytest.approx(result.std) != 0
+    assert found.half_width == pytest.approx(3.182446 * np.std(result.returns, ddof=1) / 2)
+    state = load(checkpoint).initial_state(1).values(include_nested=True, leaves_only=True)
+    assert found.state_bytes == sum(4 * part.numel() for part in state) > 0
 
 
 def set_score(plain: Plain) -> None:
@@ -141,12 +167,28 @@ def show_the_state(plain: Plain) -> None:
     plain["observations"]["training"].append("state")
 
 
+def play_by_the_state(plain: Plain) -> None:
+    plain["observations"]["acting"].append("state")
+
+
 def hide_the_observations(plain: Plain) -> None:
     plain["observations"] = {"acting": ["pixels"]}
 
 
 def set_rules(plain: Plain) -> None:
     plain["environments"]["rules"] = "reference"
+
+
+def set_size(plain: Plain) -> None:
+    plain["environments"]["obs_size"] = 256
+
+
+def set_memory(plain: Plain) -> None:
+    plain["memory"] = "lru"
+
+
+def set_algorithm(plain: Plain) -> None:
+    plain["algorithm"] = "ppo"
 
 
 def set_options(plain: Plain) -> None:
@@ -188,8 +230,12 @@ FALSIFIED: dict[Callable[[Plain], None], str] = {
     set_game: "the game PairsEasy-v0 is none of this package, and the board compares agents on",
     set_protocol: "protocol is 2; the protocol of this version demands 1",
     show_the_state: "privileged observation in training: 'state'",
+    play_by_the_state: "privileged observation in acting: 'state'",
     hide_the_observations: "observations.training does not say what the agent reads",
     set_rules: "environments.rules is reference",
+    set_size: "environments.obs_size is 256",
+    set_memory: "memory is 'mingru', the entry says 'lru'",
+    set_algorithm: "algorithm is 'pqn', the entry says 'ppo'",
     set_options: "env_options make another task",
     train_the_pomdp_on_the_mdp: "observability is 'full', the entry says 'partial'",
     set_gamma: "differs in pqn.gamma (0.99 != 0.5)",
@@ -220,6 +266,56 @@ def test_agents_of_some_games_may_be_smaller_than_the_largest(
 
     monkeypatch.setattr(checks.Evaluator, "play", play_smaller)
     assert check(write(tmp_path, honest), runs, protocol=SHORT).equal == 4
+
+
+def test_a_part_of_an_entry_need_not_have_its_largest_agent(
+    runs: Path, honest: Plain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    play = checks.Evaluator.play
+
+    def play_smaller(self: Any, checkpoint: Path, twin: str) -> Any:
+        return replace(play(self, checkpoint, twin), parameters=honest["parameters"] - 100)
+
+    monkeypatch.setattr(checks.Evaluator, "play", play_smaller)
+    assert check(write(tmp_path, honest), runs, 1, SHORT).equal == 1
+    assert "is the largest of the runs" in refusal(write(tmp_path, honest), runs)
+
+
+def test_the_folder_of_a_run_is_the_one_with_its_weights_then_one_that_was_trained(
+    honest: Plain, tmp_path: Path
+) -> None:
+    """Beside them lie runs of the same settings that stopped, and a damaged one."""
+    entry = entry_of(honest)
+    run = entry.runs[0]
+
+    def copy_of(name: str) -> Path:
+        return write_run(tmp_path / name, observability=run.twin, seed=run.seed)
+
+    stopped, other = copy_of("a"), copy_of("b")
+    shutil.rmtree(next(stopped.glob("checkpoints/frames-*")))
+    weights = next(other.rglob("weights.safetensors"))
+    weights.write_bytes(weights.read_bytes()[:-1] + b"x")
+    (copy_of("c") / "config.json").write_text("{")
+    assert checks.find_folders(entry, [run], tmp_path) == {run.cell: other}
+    own = copy_of("d")
+    assert checks.find_folders(entry, [run], tmp_path) == {run.cell: own}
+
+
+def test_which_part_is_drawn_cannot_be_foreseen(
+    runs: Path, honest: Plain, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever knows it needs to be honest in that part alone."""
+    played = set()
+
+    def play_none(entry: Any, chosen: Any, *rest: Any) -> Any:
+        played.add(tuple(run.cell for run in chosen))
+        return chosen, 0
+
+    monkeypatch.setattr(checks, "_play_again", play_none)
+    for _ in range(12):
+        random.seed(0)
+        check(write(tmp_path, honest), runs, 2, SHORT)
+    assert len(played) > 1
 
 
 def test_other_weights_are_refused_before_they_are_loaded(
@@ -393,7 +489,42 @@ def test_runs_without_the_checkpoint_of_their_end_are_refused_before_any_is_eval
 ) -> None:
     write_pair(tmp_path)
     last = max(tmp_path.glob("*/checkpoints/frames-*"))
-    shutil.rmtree(last)
+    last.rename(last.with_name("frames-000000000256"))  # an earlier one is no agent of the end
     monkeypatch.setattr(submits.Evaluator, "play", no_episodes)
     with pytest.raises(EntryRefusedError, match="has no checkpoint frames-"):
         submit([tmp_path], WORDS, protocol=SHORT)
+
+
+def test_an_agent_that_turns_out_to_read_the_state_makes_no_entry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_pair(tmp_path)
+    read = iter((("pixels",), ("pixels", "state")))  # one of the runs alone
+
+    def play(self: Any, checkpoint: Path, twin: str) -> Played:
+        return Played(0.0, 0.0, 0.0, "0" * 64, 1, 1, next(read))
+
+    monkeypatch.setattr(submits.Evaluator, "play", play)
+    with pytest.raises(EntryRefusedError, match="privileged observation in training: 'state'"):
+        submit([tmp_path], WORDS, protocol=SHORT)
+
+
+def test_an_entry_of_several_games_says_the_largest_of_each_and_keeps_the_settings_of_every_game(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write_pair(tmp_path)
+    write_pair(tmp_path, env="CountRecallEasy-v0", pqn={"gamma": 0.5})
+    sizes = iter((1, 4, 3, 2))
+
+    def play(self: Any, checkpoint: Path, twin: str) -> Played:
+        size = next(sizes)
+        assert f"-{twin}-" in str(checkpoint)
+        read = ("pixels", "last_action") if size == 4 else ("pixels",)
+        return Played(0.0, 0.0, 0.0, "0" * 64, size, 10 * size, read)
+
+    monkeypatch.setattr(submits.Evaluator, "play", play)
+    entry = submit([tmp_path], WORDS, protocol=SHORT)
+    assert (entry.parameters, entry.state_bytes) == (4, 40)
+    assert entry.observations["acting"] == ["last_action", "pixels"]
+    gammas = {run.game: entry.config(run).pqn.gamma for run in entry.runs}
+    assert gammas == {GAME: 0.99, "CountRecallEasy-v0": 0.5}

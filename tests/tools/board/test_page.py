@@ -150,8 +150,22 @@ def test_the_page_says_what_was_checked_and_forgets_it_when_the_file_changes(
     write_record(file, record)
     text = "4 of 6 trained and evaluated again 2026-11-27, 3 equal to the bit, others within 0.0100"
     assert text in board(results)
+    assert "Checked: 1 entries, 4 runs evaluated again." in board(results)
     file.write_text(json.dumps(plain | {"note": "another"}))
     assert "| not yet |" in board(results)
+
+
+def test_every_entry_stands_in_the_table_of_its_class(tmp_path: Path) -> None:
+    frames = {"100k": 98_304, "2.5M": 2_500_000, "20M": 20_000_000, "open": 40_000_000}
+    entries = {}
+    for place, name in enumerate(frames):
+        entries[f"e{place}"] = fabricated_entry(f"of {name}", QUICK, frames=frames[name])
+    text = board(write_board(tmp_path, **entries))
+    for name in frames:
+        for table in (f"### quick, class {name}\n", f"### {QUICK[0]}, class {name}\n"):
+            assert text.count(table) == 1
+            rows = text.partition(table)[2].partition("\n#")[0]
+            assert [other for other in frames if f"of {other} |" in rows] == [name]
 
 
 def test_the_page_is_written_between_its_marks(tmp_path: Path) -> None:

@@ -83,7 +83,33 @@ def test_what_is_pulled_is_checked_and_pulled_once(
     assert "2 of 2 pulled and evaluated again" in _checked(record)
     assert len(client.fetched) == 6 and not any("trainer" in name for name in client.fetched)
     check(file, tmp_path / "pulled", protocol=SHORT, weights="pulled")
+    entry = read_entry(file)
+    pull(entry, entry.runs, tmp_path / "pulled")
     assert len(client.fetched) == 6
+
+
+@pytest.mark.parametrize("written", [1, 2])
+def test_a_pull_that_was_cut_off_goes_on_with_whole_runs(
+    board: tuple[Path, FolderHub], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, written: int
+) -> None:
+    """A run is there once its weights are: what else it needs has to be there before them."""
+    entry = read_entry(board[0])
+    write, left = pulls.write_atomic, [True] * written
+
+    def write_some(file: Path, content: bytes) -> None:
+        if not left:
+            raise KeyboardInterrupt
+        left.pop()
+        write(file, content)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(pulls, "write_atomic", write_some)
+        pull(entry, entry.runs, tmp_path / "pulled")
+    pull(entry, entry.runs, tmp_path / "pulled")
+    for run in entry.runs:
+        folder = tmp_path / "pulled" / folder_name(entry, run)
+        names = {file.name for file in folder.rglob("*") if file.is_file()}
+        assert names == {"config.json", "meta.json", "weights.safetensors"}
 
 
 def test_runs_of_the_same_settings_with_other_weights_may_lie_beside_what_is_pulled(
