@@ -161,7 +161,7 @@ class BatchedGame(Generic[State]):
         them or not.
 
         An episode that has ended stays as it is: state, counts and both flags, with the reward 0,
-        and its random key.
+        and its random key. Its last action is the given one, as in every env.
         """
         action = as_actions(action, batch.step_count.shape)
         stepped, outcome = self._step_running(self.without_ends(batch), action)

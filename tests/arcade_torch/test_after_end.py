@@ -39,6 +39,8 @@ def test_frames_flags_and_counts_stay_and_nothing_is_paid(id):
         for key in ("pixels", "done", "terminated", "truncated", "step_count", "episode_reward"):
             assert (row[key][end:] == row[key][end]).all(), key
         assert (row["reward"][end + 1 :] == 0).all()
+    # the last action is the one that was given, heeded or not
+    assert torch.equal(env.get_state()["last_action"].long(), data["last_action"][:, -1])
 
 
 @pytest.mark.parametrize("path", ["step_and_maybe_reset", "collect"])
