@@ -58,6 +58,8 @@ def test_a_gap_below_zero_becomes_lower_or_higher() -> None:
 
     assert "memory raises the observability gap by 0.40" in said(-0.4, 0.0)
     assert "memory lowers the observability gap by 0.40" in said(-0.1, -0.5)
+    closed = said(0.2, -0.001)
+    assert "lru 0.00" in closed and "memory narrows the observability gap by 0.20" in closed
     assert "memory narrows the observability gap by 0.40" in said(0.5, 0.1)
     assert "memory widens the observability gap by 0.40" in said(0.1, 0.5)
     wide = [10 * more for more in six]

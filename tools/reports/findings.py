@@ -42,14 +42,16 @@ def score_sentence(table: GapBias, name: str, agent: str) -> str:
 
 def gap_sentence(table: GapBias, memory_free: AgentRow, agent: AgentRow) -> str:
     """What partial observability costs an agent with memory, and one without."""
+    # as they are printed, and without a minus before zero
+    without, with_memory = (round(row.gap.value, 2) + 0.0 for row in (memory_free, agent))
     fact = (
-        f"Partial observability costs the memory-free agent {memory_free.gap.value:.2f} of "
-        f"normalised return and {agent.agent} {agent.gap.value:.2f}"
+        f"Partial observability costs the memory-free agent {without:.2f} of normalised return and "
+        f"{agent.agent} {with_memory:.2f}"
     )
     difference = table.difference("gap", memory_free.agent, agent.agent)
     size = f"{abs(difference.value):.{difference.decimals()}f}"
     # a gap below zero that rises to zero is no wider
-    is_signed = min(memory_free.gap.value, agent.gap.value) < 0
+    is_signed = min(without, with_memory) < 0
     seeds = min(memory_free.seeds, agent.seeds)
     if not difference.exists:
         return (
