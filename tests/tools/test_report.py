@@ -25,6 +25,7 @@ from arcade_torch.tools.measures.saliency import figure as saliency
 from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import findings
 from arcade_torch.tools.runs import Score
+from arcade_torch.tools.studies.grid import Study
 from tests.tools.fabricated import FINAL, small_study, write_run, write_study
 
 LEVELS = {
@@ -156,6 +157,16 @@ def test_runs_that_cannot_be_compared_are_not_pooled(tmp_path: Path, no_oracles:
         report(tmp_path / "s", skip=("saliency",))
 
 
+def page_without_an_mdp(study: Study, memory: str, root: Path) -> str:
+    """The report of a study in which one memory has no run on CartPoleEasy's MDP."""
+    folder = write_study(root / "s", study)
+    for run in study.runs():
+        if (run.game, run.memory, run.observability) == ("CartPoleEasy", memory, "full"):
+            shutil.rmtree(folder.run(run).path)
+    parts = ("saliency", "recall", "counterfactual", "beliefs", "contamination")
+    return report(folder.root, skip=parts).read_text()
+
+
 def test_a_mean_over_fewer_tasks_is_said_to_be_one(
     tmp_path: Path, no_oracles: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -163,12 +174,7 @@ def test_a_mean_over_fewer_tasks_is_said_to_be_one(
         monkeypatch.setitem(FINAL, (twin, "gru"), 0.4)
     games = ["MineSweeperEasy", "CartPoleEasy"]
     study = small_study(subject="mingru", memories=["gru", "mlp", "mingru"], games=games)
-    folder = write_study(tmp_path / "s", study)
-    for run in study.runs():
-        if (run.game, run.memory, run.observability) == ("CartPoleEasy", "gru", "full"):
-            shutil.rmtree(folder.run(run).path)
-    parts = ("saliency", "recall", "counterfactual", "beliefs", "contamination")
-    page = report(folder.root, skip=parts).read_text()
+    page = page_without_an_mdp(study, "gru", tmp_path)
     assert "gru has no finished run on CartPoleEasy MDP: its means are of the other tasks." in page
     assert "on the MDP, 1 of 2 tasks, mingru reaches a normalised return of 0.76 and gru" in page
     assert page.count("over the 1 of 2 games that all agents have.") == 6  # gap, POMDP, bias
@@ -182,12 +188,7 @@ def test_a_mean_of_the_subject_over_fewer_tasks_is_said_to_be_one(
     """Before: its POMDPs were all games, its MDPs one less, and nothing said so."""
     games = ["MineSweeperEasy", "CartPoleEasy"]
     study = small_study(subject="mingru", baseline="gru", games=games)
-    folder = write_study(tmp_path / "s", study)
-    for run in study.runs():
-        if (run.game, run.memory, run.observability) == ("CartPoleEasy", "mingru", "full"):
-            shutil.rmtree(folder.run(run).path)
-    parts = ("saliency", "recall", "counterfactual", "beliefs", "contamination")
-    page = report(folder.root, skip=parts).read_text()
+    page = page_without_an_mdp(study, "mingru", tmp_path)
     assert "on the MDP, 1 of 2 tasks, mingru reaches" in page
     assert "On the POMDP mingru reaches" in page
     assert "mingru has no finished run on CartPoleEasy MDP: all means are of the other" in page

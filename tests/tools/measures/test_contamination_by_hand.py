@@ -11,7 +11,7 @@ from torch import Tensor
 
 from arcade_torch.tools import Policy, contamination, contamination_example
 from arcade_torch.tools.measures.windows import greedy_windows
-from tests.tools.measures.toys import ACTIONS, FEATURES, ToyEnv, matrices
+from tests.tools.measures.toys import ACTIONS, FEATURES, ToyEnv, in_place, matrices
 
 Array = NDArray[np.float64]
 LENGTHS = (9, 14, 7)
@@ -45,20 +45,10 @@ def noting_policy() -> tuple[Policy, list[Tensor]]:
         frames.extend(pixels)
         return pixels.flatten(1) @ encoder.T
 
-    def remember(
-        features: Tensor, last_action: Tensor, is_init: Tensor, state: Any
-    ) -> tuple[Tensor, Tensor]:
-        outputs = []
-        for t in range(features.shape[1]):
-            state.masked_fill_(is_init[:, t, None], 1.0)
-            state.mul_(RHO).add_(features[:, t])
-            outputs.append(state @ head.T)
-        return torch.stack(outputs, 1), state
-
     def initial_state(size: int) -> Tensor:
         return torch.zeros(size, FEATURES, dtype=torch.float64)
 
-    return Policy(encode, remember, initial_state), frames
+    return Policy(encode, in_place(RHO, head), initial_state), frames
 
 
 def outputs_by_hand(frames: Array) -> Array:

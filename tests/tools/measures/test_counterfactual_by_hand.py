@@ -15,7 +15,14 @@ from arcade_torch.tools.measures.counterfactual.measure import (
     counterfactual_of_windows,
 )
 from arcade_torch.tools.measures.windows import Window
-from tests.tools.measures.toys import ACTIONS, FEATURES, ToyEnv, linear_policy, matrices
+from tests.tools.measures.toys import (
+    ACTIONS,
+    FEATURES,
+    ToyEnv,
+    in_place,
+    linear_policy,
+    matrices,
+)
 
 Array = NDArray[np.float64]
 RHO, GAIN, WHITE = 0.7, 0.4, 255.0
@@ -30,22 +37,12 @@ def policy(kind: str) -> Policy:
     """
     encoder, head = matrices()
 
-    def remember(
-        features: Tensor, last_action: Tensor, is_init: Tensor, state: Any
-    ) -> tuple[Tensor, Tensor]:
-        outputs = []
-        for t in range(features.shape[1]):
-            state.masked_fill_(is_init[:, t, None], 1.0)
-            state.mul_(RHO).add_(features[:, t])
-            outputs.append(GAIN * state @ head.T)
-        return torch.stack(outputs, 1), state
-
     def read(out: Tensor, output: str) -> Tensor:
         return out.softmax(-1) if output == "probs" else out
 
     return Policy(
         lambda frames: (frames.double() / WHITE).flatten(1) @ encoder.T,
-        remember,
+        in_place(RHO, head, GAIN),
         lambda size: torch.zeros(size, FEATURES, dtype=torch.float64),
         read=read,
         offers=("q",) if kind == "q" else ("logits", "probs"),

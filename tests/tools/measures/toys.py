@@ -41,6 +41,24 @@ def linear_policy(
     )
 
 
+def in_place(rho: float, head: Tensor, gain: float = 1.0) -> Any:
+    """A ``remember`` like that of `linear_policy`, whose state is 1 where an episode starts and is
+    changed in place.
+    """
+
+    def remember(
+        features: Tensor, last_action: Tensor, is_init: Tensor, state: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        outputs = []
+        for t in range(features.shape[1]):
+            state.masked_fill_(is_init[:, t, None], 1.0)
+            state.mul_(rho).add_(features[:, t])
+            outputs.append(gain * state @ head.T)
+        return torch.stack(outputs, 1), state
+
+    return remember
+
+
 def matrices() -> tuple[Tensor, Tensor]:
     """The encoder [FEATURES, pixels] and the head [ACTIONS, FEATURES] of `linear_policy`."""
     generator = torch.Generator().manual_seed(0)
