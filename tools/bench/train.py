@@ -18,9 +18,9 @@ from arcade_torch.agents.presets import preset
 from arcade_torch.agents.trainer import Trainer
 from arcade_torch.tools.bench.harness import Measure, interleaved
 from arcade_torch.tools.bench.registry import BenchOptions
-from arcade_torch.tools.commands import Unless
 from arcade_torch.tools.machine import torch_threads
 from arcade_torch.tools.options import at_least
+from arcade_torch.tools.switches import Unless
 
 FORMS = {
     "eager": {},

@@ -8,10 +8,10 @@ import tyro
 
 from arcade_torch.agents.runs.files import check_writable_folder, write_atomic, write_json
 from arcade_torch.tools.cards.study import FRAMES, GAMES, SEEDS
-from arcade_torch.tools.commands import Unless
 from arcade_torch.tools.imports import is_from_user
 from arcade_torch.tools.options import Command, at_least, command_line
 from arcade_torch.tools.progress import Bars
+from arcade_torch.tools.switches import Unless
 from arcade_torch.tools.text import counted, say
 
 

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from arcade_torch.agents.checked import require
-from arcade_torch.tools.commands import Unless
 from arcade_torch.tools.commands.study import Resumable, check_memories_of
 from arcade_torch.tools.figures import Part
 from arcade_torch.tools.imports import is_from_user
@@ -16,6 +15,7 @@ from arcade_torch.tools.studies.budget import FEWEST_FRAMES, Budget, Size, measu
 from arcade_torch.tools.studies.folder import StudyFolder
 from arcade_torch.tools.studies.grid import Study, compare_study
 from arcade_torch.tools.studies.runner import make_engine, planned
+from arcade_torch.tools.switches import Unless
 from arcade_torch.tools.text import counted, say, warn
 
 GAMES = ("SignpostEasy", "MineSweeperEasy", "CountRecallEasy")

@@ -9,9 +9,9 @@ import tyro
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import check_writable_folder, read_bytes
 from arcade_torch.agents.runs.shipped import agent_folder
-from arcade_torch.tools.commands import Unless
 from arcade_torch.tools.imports import existing_agent, import_again
 from arcade_torch.tools.options import Command, at_least
+from arcade_torch.tools.switches import Unless
 from arcade_torch.tools.text import counted, say
 
 MOST_EXTRA = 64 * 2**20

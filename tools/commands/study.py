@@ -10,7 +10,6 @@ import tyro
 
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.runs.files import check_writable
-from arcade_torch.tools.commands import Unless
 from arcade_torch.tools.figures import Part
 from arcade_torch.tools.options import Command, command_line
 from arcade_torch.tools.studies.engines import Engine, Inline, RayOptions
@@ -19,6 +18,7 @@ from arcade_torch.tools.studies.grid import STUDY_PRESETS, Study, demo_study, st
 from arcade_torch.tools.studies.processes import Processes
 from arcade_torch.tools.studies.runner import DiskFullError, make_engine, planned, study
 from arcade_torch.tools.studies.shards import part_of
+from arcade_torch.tools.switches import Unless
 from arcade_torch.tools.text import counted, say
 
 

@@ -12,11 +12,11 @@ from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.presets import preset
 from arcade_torch.agents.runs.files import check_writable, read_json, write_json
 from arcade_torch.envs_jax import resolve_id
-from arcade_torch.tools.commands import Unless
 from arcade_torch.tools.imports import existing_agent, import_again, imports_of, load_agent
 from arcade_torch.tools.memory_files import LateImports, check_memory_of
 from arcade_torch.tools.options import Command, at_least, command_line, name_and_value
 from arcade_torch.tools.options import parse as parse_options
+from arcade_torch.tools.switches import Unless
 from arcade_torch.tools.text import say
 
 if TYPE_CHECKING:
