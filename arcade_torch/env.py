@@ -249,7 +249,7 @@ class ArcadeEnv(BaseEnv):
 
         Returns:
             The root tensordict: what a policy acts on next; ``done`` where an episode has ended and
-            waits for a reset.
+            waits for a reset, and nowhere until the first step behind ``set_state``.
         """
         wait_for_torch(self.device, self._jax_device)
         frames = to_torch(self._batched.render(self._with_ends()), self.device)
