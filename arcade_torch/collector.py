@@ -77,7 +77,7 @@ class ArcadeCollector(BaseCollector):
             collected.
         compact_obs: Leave ``("next", "pixels")`` out of iterated batches.
         store: Keys to store beside the standard ones (a prefix stands for all below it); None for
-            everything that the policy writes.
+            everything that the policy writes, but for private names such as ``_ou_steps``.
         store_states: Whether batches hold a policy's recurrent state at every step, as TorchRL's
             losses expect. Turn it off for large states.
         exploration_type: As in TorchRL's collectors.
