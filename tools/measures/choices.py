@@ -38,7 +38,7 @@ def check_choices(agent: Any, window: "Window") -> None:
     from arcade_torch.agents.policy import Agent
 
     policy = as_policy(agent)
-    offered = [name for name in ("q", "logits") if name in policy.offers]
+    offered = [name for name in ("q", "logits", "probs") if name in policy.offers]
     acts_by_itself = policy.step is not None or agent is not policy
     if isinstance(agent, Agent) or not acts_by_itself or not offered:
         return

@@ -60,6 +60,12 @@ def are_near(values: Tensor, others: Tensor, share: float) -> bool:
     return float(differences(values.double(), others.double()).norm()) <= share * float(size)
 
 
+def logarithms(probs: Tensor) -> Tensor:
+    """The logarithms of probabilities; minus infinity of 0, without a gradient."""
+    is_possible = probs > 0  # the gradient of log(0) is no number
+    return torch.where(is_possible, probs, 1).log().masked_fill(~is_possible, -torch.inf)
+
+
 def hidden(values: Tensor, p: Tensor, q: Tensor) -> Tensor:
     """Outputs [..., A] with minus infinity for actions whose logarithms of probabilities are so in
     two situations, ``p`` and ``q``; where a single action has any probability nothing is hidden.

@@ -37,7 +37,7 @@ from arcade_torch.models.networks import MemoryNetwork
 from arcade_torch.tools.measures.arguments import check_white, no_policy
 from arcade_torch.tools.measures.frames import float_type, floats_are_taken
 from arcade_torch.tools.measures.keys import Channels, Keys, Names, refuse_unknown
-from arcade_torch.tools.measures.masked import are_near, refuse_nan
+from arcade_torch.tools.measures.masked import are_near, logarithms, refuse_nan
 
 Target = Literal["auto", "q", "logits", "probs", "value"]
 Progress = Callable[[int, int], None]  # called with (done, of how many)
@@ -90,7 +90,13 @@ class Policy:
 
     def _of_actions(self, out: Tensor) -> Tensor:
         """The numbers of actions [..., A] among outputs [..., R]."""
-        return self.read(out, "q" if "q" in self.offers else "logits")
+        return self.read(out, "q") if "q" in self.offers else self.logits(out)
+
+    def logits(self, out: Tensor) -> Tensor:
+        """Logits [..., A], those of a policy that offers probabilities alone their logarithms."""
+        if "logits" in self.offers or "probs" not in self.offers:
+            return self.read(out, "logits")
+        return logarithms(self.read(out, "probs"))
 
     @torch.no_grad()
     def act(self, obs: Any, state: Any) -> tuple[Tensor, dict[str, Tensor], Any]:
@@ -436,9 +442,7 @@ def resolve(model: Any, target: str) -> str:
 
 def outputs(model: Any, target: str = "auto") -> Callable[[Tensor], Tensor]:
     """How the scalars that an analysis looks at, [..., K], follow from what ``remember`` returns,
-    [..., R].
-
-    ``target`` is ``q``, ``logits``, ``probs``, ``value`` or ``auto``, see `resolve`.
+    [..., R]; ``target`` as for `resolve`.
     """
     policy = as_policy(model)
     name = resolve(policy, target)

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import torch
 from tensordict import unravel_key
 from tensordict.nn import (
     ProbabilisticTensorDictModule,
@@ -20,6 +19,7 @@ from torchrl.modules import EGreedyModule, GRUModule, LSTMModule, QValueModule
 from arcade_torch.models.memory_module import MemoryModule
 from arcade_torch.models.recurrence import Key
 from arcade_torch.tools.measures.keys import Keys, Kind, Names
+from arcade_torch.tools.measures.masked import logarithms
 
 STANDARD_OUTPUTS: Mapping[Key, Kind] = {"action_value": "q", "logits": "logits", "probs": "probs"}
 """What the outputs under TorchRL's usual names are."""
@@ -66,9 +66,7 @@ class Output:
         if self.kind == "logits" and target == "probs":
             return actions.softmax(-1)
         if self.kind == "probs" and target == "logits":
-            # no probability has no gradient: that of log(0) is no number
-            is_possible = actions > 0
-            return torch.where(is_possible, actions, 1).log().masked_fill(~is_possible, -torch.inf)
+            return logarithms(actions)
         return actions
 
 

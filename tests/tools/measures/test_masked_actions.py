@@ -74,6 +74,29 @@ def test_an_action_that_is_masked_out_changes_no_measure(kind: str) -> None:
     np.testing.assert_allclose(other, one, rtol=1e-5)
 
 
+def test_a_policy_that_offers_probabilities_alone_is_measured_as_one_that_has_logits() -> None:
+    def read(out: Tensor, output: str) -> Tensor:
+        assert output == "probs", "it offers nothing else"
+        return out.softmax(-1)
+
+    with_logits = plain("logits")
+    alone = replace(with_logits, read=read, offers=("probs",))
+    noise: dict[str, Any] = {"sigmas": (1.0,), "delays": (0, 1), "starts": 10, "feedback": True}
+    wanted, got = (
+        contamination(policy, ToyEnv([6, 8]), **noise, target="probs")
+        for policy in (with_logits, alone)
+    )
+    assert wanted.mean("flip").max() > 0
+    for name in ("flip", "change", "kl"):
+        np.testing.assert_allclose(getattr(got, name), getattr(wanted, name), 1e-4, 1e-7)
+    before, after = (
+        counterfactual(policy, ToyEnv([6] * 6), episodes=6, donors=2, target="probs")
+        for policy in (with_logits, alone)
+    )
+    for name in ("flip", "distance", "change"):
+        np.testing.assert_allclose(getattr(after, name), getattr(before, name), 1e-4, 1e-7)
+
+
 def of_probs(rho: float = 0.5) -> TensorDictSequential:
     """A policy that writes probabilities, one of them 0, of the last frame alone."""
     policy = linear_policy(rho, dtype=torch.float32, pixel_scale=255.0)

@@ -304,7 +304,7 @@ def _compare(model: Any, target: str, raw: Tensor, decisions: Ints) -> Changes:
     before = before.expand_as(after)
     kl = torch.full_like(flip, torch.nan)
     if target in ("logits", "probs"):
-        logits = outputs(model, "logits")
+        logits = as_policy(model).logits
         p = logits(clean).double().cpu().log_softmax(-1).expand_as(after)
         q = logits(disturbed).double().cpu().log_softmax(-1)
         kl = masked.divergence(p, q)

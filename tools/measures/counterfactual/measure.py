@@ -400,7 +400,7 @@ class Exchange:
             values = read(raw).double().cpu()
             best = read(clean).double().cpu().topk(2).values
             return values, (values / (best[0] - best[1])).softmax(-1)
-        logits = outputs(self.policy, "logits")(raw).double().cpu()
+        logits = self.policy.logits(raw).double().cpu()
         return logits.log_softmax(-1), logits.softmax(-1)
 
     def _compare(
