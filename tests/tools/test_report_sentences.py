@@ -116,3 +116,22 @@ def test_the_highest_of_a_row_is_bold_beside_one_that_is_no_number(tmp_path: Pat
     assert len(rows) == 2
     for row in rows:
         assert re.search(r'heat".*nan</td><td class="heat best"', row), row
+
+
+def test_a_study_of_one_twin_says_what_its_intervals_are_worth(tmp_path: Path) -> None:
+    """Before: that stood beside gap and bias alone, which it has not."""
+    write_study(tmp_path / "two", small_study(observability=["partial"]))
+    page = report(tmp_path / "two", skip=get_args(Part)).read_text()
+    assert re.search(r"With 2 seeds such an interval held the true mean in \d\d % of", page)
+    write_study(tmp_path / "one", small_study(observability=["partial"], seeds=[0]))
+    page = report(tmp_path / "one", skip=get_args(Part)).read_text()
+    assert "With a single seed there are no intervals" in page
+
+
+def test_the_subject_of_a_study_of_one_twin_names_the_score(tmp_path: Path) -> None:
+    """Before: the score stood below the table of gap and bias alone."""
+    write_study(tmp_path / "s", small_study(observability=["partial"], subject="mingru"))
+    page = report(tmp_path / "s", skip=get_args(Part), metric="train_max_ewm").read_text()
+    assert "Normalised returns by the best smoothed training return, as in the paper" in page
+    page = report(tmp_path / "s", skip=get_args(Part)).read_text()
+    assert "Normalised returns by the mean return of the final greedy evaluation" in page

@@ -30,6 +30,7 @@ from arcade_torch.tools.players import Baseline, references
 from arcade_torch.tools.reports import panels
 from arcade_torch.tools.reports.ahead import Piece, measure_ahead, measure_shard, pieces_of_runs
 from arcade_torch.tools.reports.findings import (
+    coverage_of_means,
     coverage_sentence,
     learning_sentence,
     score_sentences,
@@ -107,6 +108,7 @@ def report(
     context: dict[str, Any] = {
         "study": study,
         "note": note,
+        "metric": metric,
         "changes": import_notes(runs.runs),
         "stopped": _stopped(runs),
         "written": time.strftime("%Y-%m-%d %H:%M"),
@@ -117,6 +119,8 @@ def report(
         players = _players(folder, runs, skip, progress)
         context |= _parts(runs, finals, cells, players, skip, progress)
         context |= _scores(folder, study, runs, metric, about)
+    if context["table"] is None:
+        context["caution"] = coverage_of_means(map(len, runs.groups().values()))
     context["subject"] = _subject_part(folder, runs, about, metric, context["table"])
     context |= how_to_repeat(folder, study, rows)
     page = environment.get_template("report.html.j2").render(context)

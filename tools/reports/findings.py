@@ -3,10 +3,10 @@ its interval excludes zero.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from arcade_torch.tools.figures.style import TWIN_NAMES
-from arcade_torch.tools.measures.bootstrap import Interval
+from arcade_torch.tools.measures.bootstrap import Interval, measured_coverage
 from arcade_torch.tools.measures.gap_bias.measure import AgentRow, GapBias
 from arcade_torch.tools.reports.subject import TRUSTED_COVERAGE, signed
 
@@ -126,16 +126,30 @@ def _ends(interval: Interval) -> str:
 
 def coverage_sentence(table: GapBias) -> str:
     """How much the intervals are worth with so few seeds."""
-    if not table.coverage:
+    return _coverage_sentence(table.coverage, table.confidence, "gap")
+
+
+def coverage_of_means(counts: Iterable[int], confidence: float = 0.95) -> str:
+    """The same where there is no table: what intervals of means are worth, of so many seeds."""
+    fewest = min((count for count in counts if count > 1), default=None)
+    coverage = dict[int, float]()
+    if fewest is not None:
+        coverage[fewest] = measured_coverage((fewest,), (), confidence)
+    return _coverage_sentence(coverage, confidence, "mean")
+
+
+def _coverage_sentence(coverage: Mapping[int, float], confidence: float, number: str) -> str:
+    """How often an interval holds the true number, by the number of seeds."""
+    if not coverage:
         return (
             "With a single seed there are no intervals: repeat with more seeds before believing a "
             "difference."
         )
-    seeds, share = min(table.coverage.items())
-    narrow = ", so it is narrower than it claims" if share < table.confidence else ""
+    seeds, share = min(coverage.items())
+    narrow = ", so it is narrower than it claims" if share < confidence else ""
     return (
-        f"Intervals are nominal {100 * table.confidence:g} % percentile bootstrap over seeds. "
-        f"With {seeds} seeds such an interval held the true gap in {100 * share:.0f} % of "
+        f"Intervals are nominal {100 * confidence:g} % percentile bootstrap over seeds. "
+        f"With {seeds} seeds such an interval held the true {number} in {100 * share:.0f} % of "
         f"simulated studies{narrow}."
     )
 
