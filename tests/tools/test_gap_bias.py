@@ -464,7 +464,8 @@ def test_scores_of_several_rules_are_not_pooled_and_lost_runs_are_told(tmp_path:
         read_scores(tmp_path / "s.csv")
 
 
-def test_returns_of_a_game_of_ones_own_outside_of_0_and_1_are_noted(tmp_path: Path) -> None:
+def test_returns_out_of_range_are_noted_with_the_range_of_their_game(tmp_path: Path) -> None:
+    """Before: those of Tetris "lie outside of [0, 1] and count as they are"; they are rescaled."""
     head = "memory,game,observability,seed,status,rules,eval_final"
     rows = [
         f"{memory},{game},{twin},0,finished,default,{value}"
@@ -473,15 +474,16 @@ def test_returns_of_a_game_of_ones_own_outside_of_0_and_1_are_noted(tmp_path: Pa
             ("LampEasy-v0", -0.5),
             ("BulbEasy-v0", 1.5),
             ("TetrisEasy-v0", -1.0),
+            ("BreakoutEasy-v0", 12.0),
             ("OwnEasy-v0", 1.0),
         )
     ]
     (tmp_path / "s.csv").write_text("\n".join([head, *rows]))
     made, *_ = figure._table(ScoreOptions(runs=(tmp_path / "s.csv",), draws=10))
-    notes = [note for note in made.notes if "outside of [0, 1]" in note]
-    assert len(notes) == 1 and notes[0].startswith(
-        "returns of LampEasy-v0, BulbEasy-v0 lie outside of [0, 1]"
-    )
+    notes = [note for note in made.notes if "outside of" in note]
+    assert len(notes) == 2
+    assert notes[0].startswith("returns of LampEasy-v0, BulbEasy-v0 lie outside of [0, 1], so")
+    assert notes[1].startswith("returns of BreakoutEasy-v0 lie outside of [-1, 1], so")
 
 
 def test_a_bare_name_and_its_version_are_one_game() -> None:

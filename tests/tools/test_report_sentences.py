@@ -7,13 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
+import pytest
+
 from arcade_torch.tools import gap_and_bias, report
 from arcade_torch.tools.measures.bootstrap import Interval
 from arcade_torch.tools.measures.gap_bias.pairs import pairs
 from arcade_torch.tools.reports import Part, findings
 from arcade_torch.tools.reports.subject import subject_sentence
 from arcade_torch.tools.runs import Score
-from tests.tools.fabricated import small_study, write_study
+from tests.tools.fabricated import FINAL, small_study, write_study
 
 
 def two_agents(**returns: Sequence[float]) -> list[Score]:
@@ -126,6 +128,16 @@ def test_a_study_of_one_twin_says_what_its_intervals_are_worth(tmp_path: Path) -
     write_study(tmp_path / "one", small_study(observability=["partial"], seeds=[0]))
     page = report(tmp_path / "one", skip=get_args(Part)).read_text()
     assert "With a single seed there are no intervals" in page
+
+
+def test_a_report_says_which_returns_lie_out_of_range(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before: `figure gap-bias` alone did."""
+    monkeypatch.setitem(FINAL, ("partial", "mingru"), 7.0)
+    write_study(tmp_path, small_study())
+    page = report(tmp_path, skip=get_args(Part)).read_text()
+    assert "Returns of MineSweeperEasy lie outside of [-1, 1], so normalised returns" in page
 
 
 def test_the_subject_of_a_study_of_one_twin_names_the_score(tmp_path: Path) -> None:

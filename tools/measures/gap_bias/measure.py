@@ -71,14 +71,25 @@ def normalise(env_id: str, value: Any) -> Any:
     return (value + 1) / 2 if game_of(env_id) in SIGNED_GAMES else value
 
 
-def tasks_out_of_range(scores: Iterable[Score], tasks: Iterable[str]) -> list[str]:
-    """Those tasks of which a normalised return lies outside of [0, 1]: games of one's own."""
+def range_notes(scores: Iterable[Score], tasks: Iterable[str]) -> list[str]:
+    """What to say of those tasks of which a normalised return lies outside of [0, 1]: games of
+    one's own, and tables in which returns are scaled otherwise.
+    """
     wide = set[str]()
     for score in scores:
         value = normalise(score.game, score.value)
-        if not -_ROUNDING <= value <= 1 + _ROUNDING:
+        if value < -_ROUNDING or value > 1 + _ROUNDING:
             wide.add(score.game)
-    return [task for task in tasks if task in wide]
+    by_range: dict[str, list[str]] = {}
+    for task in tasks:
+        if task in wide:
+            ends = "[-1, 1]" if game_of(task) in SIGNED_GAMES else "[0, 1]"
+            by_range.setdefault(ends, []).append(task)
+    return [
+        f"returns of {', '.join(names)} lie outside of {ends}, so normalised returns, gap and bias "
+        f"are off their scale: returns of these games must lie in {ends}"
+        for ends, names in by_range.items()
+    ]
 
 
 @dataclass(frozen=True)
