@@ -33,6 +33,9 @@ os.environ["XDG_STATE_HOME"] = str(Path(__file__).resolve().parents[1] / ".pytes
 # A shell has what it starts in the background ignore Ctrl-C, and so would all that tests start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+# So does nohup with SIGHUP. These tests still do; what they start does as behind a terminal.
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, lambda number, frame: None)
 
 # Compilation makes the first example slow, and a red test has to stay red when it is run again.
 settings.register_profile(

@@ -18,3 +18,22 @@ def test_ctrl_c_reaches_what_tests_start_in_the_background() -> None:
         check=False,
     )
     assert done.stdout.strip() == "default_int_handler", done
+
+
+def test_a_hang_up_reaches_what_tests_start_under_nohup() -> None:
+    """The tests of signals failed there. What tests start has the handlers of a terminal, and the
+    tests themselves go on.
+    """
+    code = (
+        "import os, signal, subprocess, sys, tests.conftest; os.kill(os.getpid(), signal.SIGHUP); "
+        "print(subprocess.call([sys.executable, '-c', "
+        "'import os, signal; os.kill(os.getpid(), signal.SIGHUP)']))"
+    )
+    done = subprocess.run(
+        ["sh", "-c", 'trap \'\' HUP; exec "$0" -c "$1"', sys.executable, code],
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.stdout.strip() == "-1", done
