@@ -114,9 +114,9 @@ class ArcadeVectorEnv(Copyable, VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[
         check_fits(num_envs, obs_size)
         if max_episode_steps not in (None, self.time_limit):
             raise ValueError(
-                f"max_episode_steps is {max_episode_steps!r}, but {self._batch.game.id} ends after "
-                f"{self.time_limit} steps, and a vector environment has no other limit: leave it "
-                "out"
+                f"max_episode_steps is {max_episode_steps!r}, but episodes of "
+                f"{self._batch.game.id} have {self.time_limit} steps at most, and a vector "
+                "environment has no other limit: leave it out"
             )
         self.single_action_space = action_space(self._batch.game.num_actions)
         self.single_observation_space = observation_space(obs_size)
