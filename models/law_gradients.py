@@ -53,6 +53,7 @@ def gradients_are_right(s: Subject) -> float:
         y: Tensor = torch.func.functional_call(s.module, weights, (x, given, flags))[0]
         return y
 
+    _refuse_sparse(s, gradients_of(s, outputs(*arguments).sum(), arguments))
     try:
         torch.autograd.gradcheck(outputs, arguments, fast_mode=True, atol=1e-5, rtol=1e-3)
     except RuntimeError as error:  # gradcheck's own error class derives from it
@@ -63,6 +64,16 @@ def gradients_are_right(s: Subject) -> float:
             CAUSE,
         ) from error
     return gradients_of_steps(s)
+
+
+def _refuse_sparse(s: Subject, gradients: Sequence[Tensor]) -> None:
+    """Refuse weights whose gradients are sparse."""
+    if any(gradient.is_sparse for gradient in gradients):
+        raise MemoryLawError(
+            s.law,
+            "the gradient of a weight is sparse, which learners can neither clip nor go by",
+            "nn.Embedding(..., sparse=True): leave sparse out",
+        )
 
 
 def gradients_of_steps(s: Subject) -> float:

@@ -250,6 +250,15 @@ class AsksForADevice(Cell):
         return super().initial_state(batch_size).to(next(self.parameters()).device)
 
 
+class Sparse(Cell):
+    def __init__(self) -> None:
+        super().__init__()
+        self.sign = nn.Embedding(2, WIDTH, sparse=True)
+
+    def read(self, x: Tensor) -> Tensor:
+        return super().read(x) + self.sign((x[..., 0] > 0).long())
+
+
 class TakesTheFirst(Cell):
     def read(self, x: Tensor) -> Tensor:
         weights = list(self.parameters())
@@ -619,6 +628,7 @@ def test_passed_before(model: type[Cell], law: str, said: str) -> None:
             "keeps the parameters elsewhere, StopIteration.",
         ),
         (RollsItsStateInPlace, "nothing leaks over a start", "an in-place write"),
+        (Sparse, "gradients are right", "nn.Embedding(..., sparse=True): leave sparse out"),
         (TakesTheFirst, "weights are registered", "elsewhere, IndexError list index out of range"),
     ],
 )
