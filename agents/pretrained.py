@@ -19,7 +19,7 @@ from arcade_torch.agents.runs.bundle import (
 )
 from arcade_torch.agents.runs.checkpoint import Checkpoint
 from arcade_torch.agents.runs.files import CheckpointError
-from arcade_torch.agents.runs.shipped import agent_folder, agents_hint
+from arcade_torch.agents.runs.shipped import agent_folder, agents_hint, no_folder
 from arcade_torch.models.presets import FEED_FORWARD
 from arcade_torch.models.registry import ALIASES, memory_names
 
@@ -74,7 +74,7 @@ def read_shared(folder: Path, sha256: str | None = None) -> Checkpoint:
     :func:`from_pretrained`.
     """
     if not folder.is_dir():
-        raise CheckpointError(f"{folder} is not a folder; {agents_hint(folder)}")
+        raise CheckpointError(f"{no_folder(folder)}; {agents_hint(folder)}")
     if sha256 is not None and not is_bundle(folder):
         raise CheckpointError(
             f"{folder} has no model.safetensors: sha256 is for an agent that was shared"

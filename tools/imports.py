@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from arcade_torch.agents.runs.files import read_bytes, read_json, write_json
-from arcade_torch.agents.runs.shipped import agent_folder, agents_hint
+from arcade_torch.agents.runs.shipped import agent_folder, agents_hint, no_folder
 from arcade_torch.tools.errors import one_line
 from arcade_torch.tools.text import warn
 
@@ -245,7 +245,7 @@ def existing_agent(path: Path) -> Path:
     """
     folder = agent_folder(path)
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder} is not a folder; {agents_hint(folder)}")
+        raise FileNotFoundError(f"{no_folder(folder)}; {agents_hint(folder)}")
     return folder
 
 

@@ -33,6 +33,7 @@ from arcade_torch.agents.runs.files import (
     read_bytes,
     write_atomic,
 )
+from arcade_torch.agents.runs.shipped import no_folder
 
 CONFIG = "config.json"
 WEIGHTS = "model.safetensors"
@@ -137,7 +138,7 @@ def find_checkpoint(path: Path) -> Checkpoint:
         names = os.listdir(path)
     # the last for names that no file can have
     except (FileNotFoundError, NotADirectoryError, ValueError) as error:
-        raise CheckpointError(f"{path} is not a folder; {hint}") from error
+        raise CheckpointError(f"{no_folder(path)}; {hint}") from error
     except OSError as error:
         raise CheckpointError(f"{path} cannot be looked at: {error.strerror}") from error
     if _META in names:

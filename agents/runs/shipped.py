@@ -36,6 +36,11 @@ def agent_folder(name: str | PathLike[str]) -> Path:
     return path
 
 
+def no_folder(path: Path) -> str:
+    """What is wrong with a path that is no folder."""
+    return f"{path} {'is not a folder' if path.exists() else 'does not exist'}"
+
+
 def agents_hint(folder: Path) -> str:
     """What to give in the place of a folder that is not there; the nearest name first."""
     names = pretrained_names()

@@ -449,8 +449,12 @@ def test_the_weights_that_act_are_evaluated_saved_and_loaded(tmp_path):
 
 
 def test_loading_nothing_says_what_was_found(tmp_path):
-    with pytest.raises(CheckpointError, match="is not a folder"):
+    with pytest.raises(CheckpointError, match="does not exist"):
         load(tmp_path / "absent")
+    (tmp_path / "file").touch()
+    with pytest.raises(CheckpointError, match="is not a folder"):
+        load(tmp_path / "file")
+    (tmp_path / "file").unlink()
     with pytest.raises(CheckpointError, match="holds no checkpoint"):
         load(tmp_path)
 

@@ -15,13 +15,14 @@ from arcade_torch.tools.errors import is_told, one_line
 
 ROOT = Path(__file__).resolve().parents[2]
 MISSING = [
-    ("evaluate nosuch", "nosuch is not a folder; give a run folder"),
+    ("evaluate file", "file is not a folder; give a run folder"),
+    ("evaluate nosuch", "nosuch does not exist; give a run folder"),
     (
         "evaluate someone/agent",
-        "someone/agent is not a folder; an agent of that name on the Hugging Face hub is fetched "
+        "someone/agent does not exist; an agent of that name on the Hugging Face hub is fetched "
         "first, arcade-torch pull someone/agent; give a run folder",
     ),
-    ("push nosuch someone/agent", "nosuch is not a folder; give a run folder"),
+    ("push nosuch someone/agent", "nosuch does not exist; give a run folder"),
     ("analyze saliency nosuch", "nosuch does not exist"),
     ("figure returns --runs nosuch", "nosuch does not exist"),
     ("report nosuch", "nosuch is not the folder of a study: it has no study.json"),
@@ -38,6 +39,7 @@ def test_a_folder_that_is_not_there_is_refused_before_torch_is_imported(tmp_path
         f"codes = [main(line.split()) for line in {[line for line, _ in MISSING]}]\n"
         "print(codes, 'torch' in sys.modules)"
     )
+    (tmp_path / "file").touch()
     ended = subprocess.run(
         [sys.executable, "-c", source],
         capture_output=True,

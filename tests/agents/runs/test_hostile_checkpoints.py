@@ -109,7 +109,7 @@ def test_a_preset_takes_no_object_for_the_numbers_of_a_learner() -> None:
 
 
 def test_a_folder_with_a_line_break_in_its_name_is_refused_in_one_line() -> None:
-    with pytest.raises(CheckpointError, match=r"no such  folder is not a folder") as refused:
+    with pytest.raises(CheckpointError, match=r"no such  folder does not exist") as refused:
         load("no such \nfolder")
     assert len(str(refused.value).splitlines()) == 1
 

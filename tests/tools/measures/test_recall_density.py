@@ -164,5 +164,5 @@ def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
         recall_density(RHO)
     with pytest.raises(TypeError, match="got object"):
         recall_density(object(), ToyEnv([5]))
-    with pytest.raises(RuntimeError, match="is not a folder"):
+    with pytest.raises(RuntimeError, match="does not exist"):
         recall_density(Path("no/such/run"))

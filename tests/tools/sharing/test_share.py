@@ -262,11 +262,11 @@ def test_an_agent_of_the_package_is_named_like_a_run(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["push", "nowhere", "./x"], "nowhere is not a folder"),
+        (["push", "nowhere", "./x"], "nowhere does not exist"),
         (["push", "signpost-partial-lru", "no repo"], "must be owner/name, or a folder"),
         (["push", "signpost-partial-lru", "./full"], "holds no shared agent"),
         (["push", "signpost-partial-lru", "./x", "--episodes", "0"], "--episodes must be at least"),
-        (["pull", "./nowhere"], "nowhere is not a folder"),
+        (["pull", "./nowhere"], "nowhere does not exist"),
         (["pull", "nonsense"], "must be owner/name, or a folder"),
         (["pull", "signpost-partial-lru", "--sha256", "0" * 64], "nothing of it was read"),
         (["pull", "signpost-partial-lru", "--sha256", "12"], "64 hexadecimal digits"),
