@@ -550,3 +550,23 @@ def test_the_command_opens_a_window_and_goes_on_with_seeds_that_the_player_has_n
         assert cli.main([*words, player]) == 0
     assert met == [(0, 3, 80, 128), (1, 3, 80, 128), (0, 3, 80, 128)]
     assert "seed 1 (full): return " in capsys.readouterr().out
+
+
+def test_an_episode_that_a_signal_cuts_off_is_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before: it was lost, and the next session gave the same seed as one never met."""
+
+    def play(played: Session, scale: int, key_repeat: int, watched: None) -> None:
+        played.press("right")
+        played.press("down")
+        raise KeyboardInterrupt  # as SIGTERM and Ctrl-C do
+
+    monkeypatch.setattr(screens, "why_no_window", lambda: None)
+    monkeypatch.setattr(screens, "play_in_window", play)
+    words = ["play", GAME, "--scores", str(tmp_path / "human.csv")]
+    for seed in (0, 1):
+        assert cli.main(words) == 130
+        row = read_csv(tmp_path / "human.csv")[seed]
+        assert (row["seed"], row["end"], row["steps"]) == (str(seed), "abandoned", "2")
+        assert f"seed {seed} (full): return" in capsys.readouterr().out

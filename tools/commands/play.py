@@ -70,7 +70,7 @@ class Play(GameCommand):
         """Play."""
         from arcade_torch.compiled import compiled_game
         from arcade_torch.tools.play import recording, scores, screens
-        from arcade_torch.tools.play.session import LEGEND, Session
+        from arcade_torch.tools.play.session import Session
 
         at_least(self, key_repeat=0, fps=0.1)
         at_most(self, fps=screens.FPS)
@@ -103,14 +103,29 @@ class Play(GameCommand):
         watched = None
         if scene.agent is not None:
             watched = screens.Watched(recording.trained(scene.agent, None), self.fps)
-        if self.plays_in_terminal():
-            screens.play_in_terminal(session, watched)
-        else:
-            print(LEGEND)
-            screens.play_in_window(session, self.scale, self.key_repeat, watched)
-        for line in said or ["no episode was played"]:
-            say(line)
+        self.show(session, watched, said)
         return 0
+
+    def show(self, session: Any, watched: Any, said: list[str]) -> None:
+        """Show a session in a window or the terminal until it is closed, then say what was played;
+        a signal leaves the running episode as Esc does.
+        """
+        from arcade_torch.tools.play import screens
+        from arcade_torch.tools.play.session import LEGEND, QUIT
+
+        in_terminal = self.plays_in_terminal()
+        try:
+            if in_terminal:
+                screens.play_in_terminal(session, watched)
+            else:
+                print(LEGEND)
+                screens.play_in_window(session, self.scale, self.key_repeat, watched)
+        finally:
+            session.press(QUIT)
+            for line in said:
+                say(line)
+        if not said:
+            say("no episode was played")
 
     def scene(self) -> "Scene":
         """What is played: as the options say, or as the agent that plays was trained."""

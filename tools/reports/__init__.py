@@ -113,7 +113,6 @@ def report(
     context: dict[str, Any] = {
         "study": study,
         "note": note,
-        "metric": metric,
         "changes": import_notes(runs.runs),
         "stopped": _stopped(runs),
         "written": time.strftime("%Y-%m-%d %H:%M"),
@@ -124,8 +123,6 @@ def report(
         players = _players(folder, runs, skip, progress)
         context |= _parts(runs, finals, cells, players, skip, progress)
         context |= _scores(folder, study, runs, metric, about)
-    if context["table"] is None:
-        context["caution"] = coverage_of_means(map(len, runs.groups().values()))
     context["subject"] = _subject_part(folder, runs, about, metric, context["table"])
     context |= how_to_repeat(folder, study, rows)
     page = environment.get_template("report.html.j2").render(context)
@@ -414,15 +411,18 @@ def _scores(
         except ValueError as error:
             trouble = trouble or str(error)
     table = tables.get(metric)
+    caution = coverage_of_means(map(len, runs.groups().values()))
     if table is not None:
         trouble = table.trouble
+        caution = coverage_sentence(table)
     second = [tables[name] for name in tables if name != metric]
     return {
+        "metric": metric,
         "trouble": trouble,
         "wide": wide,
         "table": table,
         "second": second[0] if second else None,
         "sentences": score_sentences(table, subject) if table is not None else [],
         "score_panels": gap_bias.score_panels(table) if table is not None else [],
-        "caution": coverage_sentence(table) if table is not None else "",
+        "caution": caution,
     }
