@@ -366,6 +366,26 @@ def test_a_resume_without_a_run_says_that_one_begins(
     assert "this one begins" not in said[1]
 
 
+def test_a_resume_that_waits_says_what_it_then_finds(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before: a second one said that no run is there and this one begins, waited, and went on with
+    the run that was there then.
+    """
+    out = tmp_path / "run"
+    words = ["train", "--preset", "smoke", "--total-frames", "128", "--out", str(out), "--resume"]
+    assert cli.main(words) == 0
+    out.rename(tmp_path / "elsewhere")
+    capsys.readouterr()
+
+    def wait(path: Path, limit_s: float) -> None:
+        (tmp_path / "elsewhere").rename(path)
+
+    monkeypatch.setattr("arcade_torch.agents.runs.folder.wait_until_free", wait)
+    assert cli.main([*words, "--wait", "60"]) == 0
+    assert "this one begins" not in capsys.readouterr().out
+
+
 def test_options_given_count_even_where_they_equal_the_presets_and_2e5_is_a_number() -> None:
     words = [
         "--preset",

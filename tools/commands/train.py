@@ -116,6 +116,7 @@ class Train(Command):
             from arcade_torch.tools.play.recording import EvaluationVideos
 
             film = EvaluationVideos(folder / "videos", f".{self.videos}")
+        wait_until_free(folder, self.wait)
         if self.resume and not (folder / "config.json").exists():
             say(f"no run in {folder} to go on with: this one begins")
         if self.resume:
@@ -124,7 +125,6 @@ class Train(Command):
         is_first = PARENT_VARIABLE not in os.environ and not (folder / "config.json").exists()
         if self.check_memory and is_first:
             check_memory_of(run)
-        wait_until_free(folder, self.wait)
         if is_first and run.amp and run.device == "cpu":
             share = bfloat16_time(run)
             if share > SLOWER:
