@@ -527,10 +527,11 @@ def test_counterfactual_recall_of_checkpoints_is_drawn_with_its_numbers(
 ) -> None:
     runs = [str(run) for run in sorted(trained.iterdir())]
     words = ["analyze", "counterfactual", *runs, "--episodes", "6", "--lags", "5"]
-    words += ["--donors", "2", "--max-frames", "8", "--out", str(tmp_path)]
+    words += ["--donors", "6", "--max-frames", "8", "--out", str(tmp_path)]
     assert cli.main(words) == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "reliance on memory and observation" in text and "gru on" in text
+    assert "fewer than 6 donors: a decision has the 5 other episodes at most" in text
     name = tmp_path / "counterfactual-MineSweeperEasy-v0-full"
     assert name.with_suffix(".png").exists() and name.with_suffix(".pdf").exists()
     rows = read_csv(name.with_suffix(".csv"))

@@ -60,6 +60,11 @@ def by_lag(options: CounterfactualOptions, progress: Progress | None) -> Made:
             f"{alone} decisions come at a step that no other episode has: no state, and no frame "
             "so late, could be exchanged"
         )
+    if options.donors >= options.episodes:
+        result.notes.append(
+            f"fewer than {options.donors} donors: a decision has the {options.episodes - 1} other "
+            "episodes at most, give more --episodes"
+        )
     return result
 
 
