@@ -4,6 +4,7 @@ that module does not go on with another without a word.
 
 import importlib
 import json
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -186,6 +187,25 @@ def test_a_module_that_is_imported_only_when_the_model_runs_is_remembered_too(
     assert cli.main(evaluate) == cli.EXIT_BAD_INPUT
     said = capsys.readouterr().err
     assert "beside_yours.py by way of" in said and "it has changed since: put it back" in said
+
+
+def test_a_run_that_goes_on_with_another_text_remembers_that(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The hash of a module that is imported late is that of the text which it goes on with."""
+    (folder / "yours.py").write_text(LATE)
+    run = folder / "run"
+    given = [*WORDS, "--out", str(run), "--import", str(folder / "yours.py"), "--no-check-memory"]
+    assert cli.main(["train", *given]) == cli.EXIT_OK
+    before = (run / "config.json").read_text()
+    (run / "eval.json").unlink()
+    shutil.rmtree(run / "checkpoints")
+    change(folder, monkeypatch)
+    assert cli.main(["train", *given, "--resume"]) == cli.EXIT_OK
+    after = (run / "config.json").read_text()
+    assert "beside_yours.py" in before and "beside_yours.py" in after and before != after
+    again(monkeypatch)
+    assert cli.main(["evaluate", str(run), "--episodes", "2"]) == cli.EXIT_OK
 
 
 @pytest.mark.parametrize("is_finished", [True, False])
