@@ -304,7 +304,8 @@ def check_return_range(game: str, return_range: tuple[float, float]) -> None:
 
 
 def move_mean(mean: nn.Module, network: nn.Module, window: float) -> None:
-    """Move a mean of weights towards those of the network that learns.
+    """Move a mean of weights towards those of the network that learns; buffers, such as statistics
+    of a batch norm, are copied.
 
     Args:
         mean: a network whose weights are the mean.
@@ -313,3 +314,5 @@ def move_mean(mean: nn.Module, network: nn.Module, window: float) -> None:
     """
     for old, new in zip(mean.parameters(), network.parameters(), strict=True):
         old.data.lerp_(new.data, 1 / (1 + window))
+    for buffer, newest in zip(mean.buffers(), network.buffers(), strict=True):
+        buffer.copy_(newest)

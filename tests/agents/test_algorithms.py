@@ -22,7 +22,7 @@ from arcade_torch.agents import (
     preset,
 )
 from arcade_torch.agents.config import GROUPS
-from arcade_torch.agents.learner import Training
+from arcade_torch.agents.learner import Training, move_mean
 from arcade_torch.agents.runs.checkpoint import Checkpoint
 from arcade_torch.agents.runs.folder import METRIC_COLUMNS
 from arcade_torch.agents.trainer import LEARNERS
@@ -130,6 +130,16 @@ def test_acting_is_learning_and_a_saved_moment_goes_on_to_the_bit(
         mine, theirs = mine.state_dict(), theirs.state_dict()
         assert all(torch.equal(mine[name], theirs[name]) for name in theirs)
         assert any(not torch.equal(moment.weights[name], theirs[name]) for name in theirs)
+
+
+def test_a_mean_of_weights_has_the_statistics_of_what_is_trained() -> None:
+    """Before: those of a batch norm stayed 0 and 1, by which it then acted and was evaluated."""
+    network, mean = torch.nn.BatchNorm1d(2), torch.nn.BatchNorm1d(2)
+    network(torch.randn(8, 2) + 3)
+    move_mean(mean, network, 9.0)
+    for name, statistic in network.named_buffers():
+        assert torch.equal(mean.get_buffer(name), statistic)
+    assert float(mean.running_mean.min()) > 0
 
 
 @algorithms
