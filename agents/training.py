@@ -66,6 +66,9 @@ def train(
     run and put back afterwards: runs in threads of one process update by turns, since they share
     it, and save no time. Take processes, as a study does.
 
+    A memory model of yours is trained as it is: `arcade_torch.models.check_memory`, which the
+    command line runs first, says whether it keeps its laws.
+
     Args:
         config: what to train.
         run_dir: folder of the run; must be empty or absent unless ``resume``.
