@@ -159,6 +159,20 @@ def test_a_curve_goes_over_the_frames_that_all_its_runs_have_reached_in_the_unit
         )
 
 
+def test_curves_are_of_the_returns_behind_the_metric(tmp_path: Path) -> None:
+    spec = RunSpec("CartPoleEasy-v0", "full", "lru", "pqn", 0)
+    write_run(tmp_path / "run", spec, 0.5, frames=3_000_000)
+    columns = {
+        "eval_final": ("eval.csv", "mean"),
+        "train_max_ewm": ("metrics.csv", "train_return_ewm"),
+    }
+    for metric, (table, column) in columns.items():
+        with drawing("light"):
+            (picture,) = logs.curves(CurveOptions((tmp_path,), metric=metric), None).pictures
+        last = float(Run(tmp_path / "run").table(table)[-1][column])
+        assert picture.rows[-1]["mean"] == pytest.approx(last), metric
+
+
 def test_bars_are_drawn_where_their_numbers_say(monkeypatch: pytest.MonkeyPatch) -> None:
     three = pooled([[[0.5, 0.0], [0.1, 0.9]], [[0.5, 0.0], [0.1, 0.0]], [[0.5, 0.0], [0.1, 0.0]]])
     runs = [Score(agent, "CartPoleEasy", twin, seed, value + 0.1 * spread * (seed == 2))
