@@ -389,6 +389,12 @@ def test_a_seed_that_is_no_whole_number_is_refused_in_one_line(seed: object) -> 
 def test_seeds_of_numpy_mean_what_those_of_python_mean() -> None:
     assert (seed_keys(np.array([3, 4]), 2) == seed_keys([3, 4], 2)).all()
     assert (seed_keys(np.int64(3), 2) == seed_keys(3, 2)).all()  # type: ignore[arg-type]
+    envs = ArcadeVectorEnv("MineSweeperEasy", 2)
+    envs.reset(seed=3)
+    drawn = envs.np_random.random()
+    for seed in (np.int64(3), np.array(3)):
+        envs.reset(seed=seed)  # type: ignore[arg-type]
+        assert envs.np_random.random() == drawn, repr(seed)
 
 
 def test_a_refused_seed_changes_nothing() -> None:
