@@ -21,7 +21,13 @@ from arcade_torch.tools import cli
 from arcade_torch.tools.figures import CurveOptions, PaperOptions, logs
 from arcade_torch.tools.figures.catalogue import FIGURES
 from arcade_torch.tools.figures.logs import Curve
-from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing, new_figure, panels
+from arcade_torch.tools.figures.style import (
+    AGENT_COLOURS,
+    drawing,
+    new_figure,
+    panels,
+    whiskers,
+)
 from arcade_torch.tools.measures import checkpoints
 from arcade_torch.tools.measures.beliefs import figure as beliefs
 from arcade_torch.tools.measures.beliefs.measure import Beliefs
@@ -171,6 +177,12 @@ def test_curves_are_of_the_returns_behind_the_metric(tmp_path: Path) -> None:
             (picture,) = logs.curves(CurveOptions((tmp_path,), metric=metric), None).pictures
         last = float(Run(tmp_path / "run").table(table)[-1][column])
         assert picture.rows[-1]["mean"] == pytest.approx(last), metric
+
+
+def test_an_interval_beside_its_mean_has_one_whisker_and_a_missing_one_none() -> None:
+    """An interval of the bootstrap need not hold the mean; matplotlib takes no length below 0."""
+    value, low, high = (np.array(row) for row in ([1.0, 1.0], [1.25, np.nan], [1.5, np.nan]))
+    np.testing.assert_array_equal(whiskers(value, low, high), [[0, np.nan], [0.5, np.nan]])
 
 
 def test_bars_are_drawn_where_their_numbers_say(monkeypatch: pytest.MonkeyPatch) -> None:
