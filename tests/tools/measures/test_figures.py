@@ -340,6 +340,7 @@ def test_what_cannot_be_compared_is_refused_in_one_line(
         (["figure", "curves", "--runs", "slow"], "none of the 1 runs below slow has finished"),
         (["figure", "curves", "--runs", "odd"], "does not describe a run"),
         (["figure", "returns", "--paper", "--confidence", "95"], "between 0 and 1"),
+        (["figure", "returns", "--paper", "--confidence", "1"], "between 0 and 1"),
         (["analyze", "gap-bias", "slow", "--paper"], "and these are named: slow; leave"),
         (["figure", "hyperparameters", "slow", "--paper"], "in the place of runs, and these are"),
         (["figure", "returns", "--paper", "--baseline", "gru"], "leave out --baseline"),
