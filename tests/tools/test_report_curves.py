@@ -44,6 +44,7 @@ def test_the_twins_of_a_game_share_a_scale_that_holds_every_seed_and_every_playe
     assert low < -3 and high > 3
 
 
+@pytest.mark.filterwarnings("error")  # of matplotlib, which makes a height of its own
 def test_a_scale_of_equal_returns_has_a_height(tmp_path: Path) -> None:
     folder = write_study(tmp_path, small_study(memories=["mlp"], seeds=[0]))
     for file in folder.root.glob("runs/*/eval.csv"):
