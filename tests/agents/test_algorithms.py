@@ -338,7 +338,7 @@ def test_an_update_is_the_loop_written_out_with_every_number_of_the_config(
 def test_warm_up_is_random_play_that_calibrates_and_an_episode_in_the_overlap_is_counted_once(
     overlap, monkeypatch
 ):
-    numbers = {"overlap": overlap, "warmup_steps": overlap + STEPS + 3}
+    numbers = {"overlap": overlap, "warmup_steps": overlap + STEPS + 7}
     trainer, seen = Trainer(config("pqn", pqn=numbers)), []
     collect = trainer.collector.collect
 
@@ -355,7 +355,7 @@ def test_warm_up_is_random_play_that_calibrates_and_an_episode_in_the_overlap_is
 
     monkeypatch.setattr(trainer.collector, "collect", look)
     trainer.warm_up()
-    assert [random for random, *_ in seen] == [True, True]  # the overlap and 11 steps more
+    assert [random for random, *_ in seen] == [True, True]  # the overlap and 19 steps more
     frames = torch.cat([pixels for _, pixels, _ in seen]).float()
     encoder = trainer.network.encoder
     mean_patches = encoder.compress(encoder.mean.permute(1, 2, 0))

@@ -254,6 +254,8 @@ def test_a_snapshot_of_an_end_stays_at_the_end(of: str) -> None:
         another.set_state(env.get_state())
     else:
         another.load_state_dict(env.state_dict())
+    seen = another.observe()
+    assert all(torch.equal(seen[key], td[key]) for key in ("done", "terminated", "truncated"))
     action = env.rand_action(td)["action"]
     expected = env.step(td.clone().set("action", action))["next"]
     assert torch.equal(expected["done"], td["done"])

@@ -18,6 +18,7 @@ from arcade_torch.envs_jax import probe_ids
 from arcade_torch.gym.batch import seed_keys
 from arcade_torch.gym.env import ArcadeGymEnv
 from arcade_torch.gym.vector import ArcadeVectorEnv
+from arcade_torch.gym.window import Window
 
 ROOT = Path(__file__).resolve().parents[2]
 GAME = "arcade_torch/MineSweeperEasy-v0"  # both ways to end: a mine, and 32 steps
@@ -333,6 +334,15 @@ def test_human_rendering_shows_every_frame_in_a_window(monkeypatch: pytest.Monke
     env.close()
     env.close()
     assert pygame.display.get_surface() is None
+
+
+def test_a_window_is_as_wide_and_high_as_its_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    pygame = pytest.importorskip("pygame", reason="needs the play extra: pip install '.[play]'")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    window = Window(2)
+    window.show(np.zeros((2, 3, 3), np.uint8), "a frame")
+    assert pygame.display.get_surface().get_size() == (6, 4)
+    window.close()
 
 
 def test_a_window_without_pygame_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
