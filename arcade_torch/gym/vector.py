@@ -20,6 +20,7 @@ from arcade_torch.envs_jax.validation import (
     check_fits,
     check_num_envs,
     partial_flags,
+    plain,
 )
 from arcade_torch.gym.batch import Bools, Frames, Info, NumpyBatch, seed_keys
 from arcade_torch.gym.copies import Copyable
@@ -153,7 +154,8 @@ class ArcadeVectorEnv(Copyable, VectorEnv[Frames, npt.NDArray[Any], npt.NDArray[
         mask = self._reset_mask(check_reset_options(options, ("reset_mask",)))
         # a seed is refused before anything changes
         keys = None if seed is None else seed_keys(seed, self.num_envs)
-        super().reset(seed=int(seed) if isinstance(seed, int | np.integer) else None)
+        one_seed = plain(seed)
+        super().reset(seed=one_seed if isinstance(one_seed, int) else None)
         if seed is None and not self._started:
             keys = seed_keys(int(self.np_random.integers(2**32)), self.num_envs)
         self._batch.reset(mask, keys)

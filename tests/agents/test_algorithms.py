@@ -344,10 +344,12 @@ def test_an_update_is_the_loop_written_out_with_every_number_of_the_config(
     assert {key: row[key] for key in wanted} == pytest.approx(wanted, rel=1e-3, abs=1e-6)
 
 
+@pytest.mark.parametrize("overlap", [6, 0])
 def test_warm_up_is_random_play_that_calibrates_and_an_episode_in_the_overlap_is_counted_once(
-    monkeypatch,
+    overlap, monkeypatch
 ):
-    trainer, seen = Trainer(config("pqn", pqn={"overlap": 6, "warmup_steps": STEPS + 7})), []
+    numbers = {"overlap": overlap, "warmup_steps": overlap + STEPS + 7}
+    trainer, seen = Trainer(config("pqn", pqn=numbers)), []
     collect = trainer.collector.collect
 
     def look(random=False):
@@ -355,15 +357,15 @@ def test_warm_up_is_random_play_that_calibrates_and_an_episode_in_the_overlap_is
         seen.append(
             (
                 random,
-                batch["pixels"][:, 6:].flatten(0, 1).clone(),
-                int(batch["next", "done"][:, 6:].sum()),
+                batch["pixels"][:, overlap:].flatten(0, 1).clone(),
+                int(batch["next", "done"][:, overlap:].sum()),
             )
         )
         return batch
 
     monkeypatch.setattr(trainer.collector, "collect", look)
     trainer.warm_up()
-    assert [random for random, *_ in seen] == [True, True]  # the overlap and 13 steps more
+    assert [random for random, *_ in seen] == [True, True]  # the overlap and 19 steps more
     frames = torch.cat([pixels for _, pixels, _ in seen]).float()
     encoder = trainer.network.encoder
     mean_patches = encoder.compress(encoder.mean.permute(1, 2, 0))
@@ -497,6 +499,18 @@ def test_the_target_network_is_renewed_every_so_many_updates(every):
         target = trainer.learner.loss.target_value_network_params["head", "weight"].data
         seen.append(torch.equal(target, before))
     assert seen == [number % every == 0 for number in range(4)]
+
+
+def test_a_state_of_dqn_keeps_the_target_network_of_its_moment():
+    trainer = Trainer(config("dqn", dqn={"target_every": 1}))
+    trainer.update()
+    target = trainer.learner.state_dict()["target"]
+    before = {name: value.clone() for name, value in target.items()}
+    trainer.update()
+    assert not torch.equal(
+        trainer.learner.state_dict()["target"]["head.weight"], before["head.weight"]
+    )
+    assert all(torch.equal(target[name], value) for name, value in before.items())
 
 
 @pytest.mark.parametrize("memory", ["lru", "mingru", "gru"])

@@ -128,6 +128,11 @@ def test_a_run_leaves_its_files(whole):
     assert type(CONFIG).from_dict(saved["config"]) == CONFIG and saved["versions"]["torch"]
 
 
+def test_an_evaluation_that_is_due_at_the_end_is_made_once(tmp_path):
+    train(dataclasses.replace(CONFIG, total_frames=128, eval_every=64), tmp_path)
+    assert [int(row["frames"]) for row in read_csv(tmp_path / "eval.csv")] == [64, 128]
+
+
 def test_resuming_a_finished_run_returns_its_result_at_once(whole, monkeypatch):
     folder, result = whole
     monkeypatch.setattr(training, "Trainer", None)

@@ -315,6 +315,15 @@ def test_sequences_replay_from_their_initial_state_and_begin_with_the_overlap(
         before = now
 
 
+def test_an_overlap_longer_than_a_window_is_moved_in_parts_that_share_no_memory() -> None:
+    """A GPU copies all parts at once; on a CPU torch refuses that of a single env."""
+    collector = ArcadeCollector(
+        ArcadeEnv(GAME, 1, seed=3), scripted, T, overlap=T + 3, return_same_td=True
+    )
+    before = steps(collector.collect())
+    assert_same(steps(collector.collect())[:, : T + 3], before[:, -T - 3 :])
+
+
 def test_the_overlap_holds_the_same_path_as_windows_without_overlap() -> None:
     plain = stub_collector(Recurrent())
     path = torch.cat([steps(plain.collect()) for _ in range(6)], 1)

@@ -12,6 +12,7 @@ from torch import nn
 
 from arcade_torch.collector import ArcadeCollector
 from tests.arcade_torch.same import assert_same
+from tests.arcade_torch.stub import LOCKSTEP
 from tests.arcade_torch.test_collector import N, Recurrent, scripted, stub_collector
 
 
@@ -36,6 +37,26 @@ def test_a_state_of_version_0_2_0_goes_on_to_the_bit(mode: Any) -> None:
     old = {"buffers": buffers, "final": overlap["final"]["final/pixels"]}
     state["overlap"] = overlap | old
     assert_same(loaded(state, **options).collect(), collector.collect())
+
+
+class WritesOverItsState(Recurrent):
+    """Right: the step behind gets another tensor."""
+
+    def forward(self, td: TensorDictBase) -> TensorDictBase:
+        td = super().forward(td)
+        td["memory", "sum"].copy_(td["next", "memory", "sum"])
+        return td
+
+
+def test_a_policy_that_writes_over_its_state_leaves_what_episodes_begin_with() -> None:
+    ours = stub_collector(WritesOverItsState(), LOCKSTEP, store_states=False, overlap=3)
+    other = stub_collector(Recurrent(), LOCKSTEP, store_states=False, overlap=3)
+    starts = 0
+    for _ in range(6):
+        batch = ours.collect()
+        assert_same(batch, other.collect())
+        starts += int(batch["is_init"][:, 0].sum())
+    assert starts >= 2 * N
 
 
 def test_what_is_written_to_a_batch_changes_no_state_that_was_saved_before() -> None:

@@ -263,6 +263,16 @@ def test_a_snapshot_of_an_end_stays_at_the_end(of: str) -> None:
         env.set_state(env.get_state().set("ends", torch.zeros(N, 2, dtype=torch.int64)))
 
 
+def test_an_env_shows_the_ends_at_which_its_episodes_wait() -> None:
+    env = made("done")
+    td = env.reset()
+    while not td["done"].all():
+        td = env.step(env.rand_action(td))["next"].exclude("reward")
+    assert td["terminated"].any() and td["truncated"].any()
+    seen = env.observe()
+    assert all(torch.equal(seen[key], td[key]) for key in ("done", "terminated", "truncated"))
+
+
 def test_observations_are_the_memory_of_jax_and_stay_as_they_are() -> None:
     env = made("plain")
     root = env.reset()

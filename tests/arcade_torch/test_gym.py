@@ -18,6 +18,7 @@ from arcade_torch.envs_jax import probe_ids
 from arcade_torch.gym.batch import seed_keys
 from arcade_torch.gym.env import ArcadeGymEnv
 from arcade_torch.gym.vector import ArcadeVectorEnv
+from arcade_torch.gym.window import Window
 
 ROOT = Path(__file__).resolve().parents[2]
 GAME = "arcade_torch/MineSweeperEasy-v0"  # both ways to end: a mine, and 32 steps
@@ -335,6 +336,15 @@ def test_human_rendering_shows_every_frame_in_a_window(monkeypatch: pytest.Monke
     assert pygame.display.get_surface() is None
 
 
+def test_a_window_is_as_wide_and_high_as_its_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+    pygame = pytest.importorskip("pygame", reason="needs the play extra: pip install '.[play]'")
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    window = Window(2)
+    window.show(np.zeros((2, 3, 3), np.uint8), "a frame")
+    assert pygame.display.get_surface().get_size() == (6, 4)
+    window.close()
+
+
 def test_a_window_without_pygame_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(ImportError, match=r"pip install '.\[play\]'"):
@@ -389,6 +399,12 @@ def test_a_seed_that_is_no_whole_number_is_refused_in_one_line(seed: object) -> 
 def test_seeds_of_numpy_mean_what_those_of_python_mean() -> None:
     assert (seed_keys(np.array([3, 4]), 2) == seed_keys([3, 4], 2)).all()
     assert (seed_keys(np.int64(3), 2) == seed_keys(3, 2)).all()  # type: ignore[arg-type]
+    envs = ArcadeVectorEnv("MineSweeperEasy", 2)
+    envs.reset(seed=3)
+    drawn = envs.np_random.random()
+    for seed in (np.int64(3), np.array(3)):
+        envs.reset(seed=seed)  # type: ignore[arg-type]
+        assert envs.np_random.random() == drawn, repr(seed)
 
 
 def test_a_refused_seed_changes_nothing() -> None:

@@ -80,6 +80,14 @@ def test_the_time_limit_can_be_read_and_wrappers_find_it() -> None:
     assert envs.spec.max_episode_steps == limit
 
 
+def test_a_spec_that_somebody_hands_over_is_not_written_to() -> None:
+    spec = gymnasium.spec("arcade_torch/CartPoleEasy-v0")
+    env = ArcadeGymEnv("CartPoleEasy")
+    env.spec = spec
+    assert env.spec.max_episode_steps == env.time_limit
+    assert spec.max_episode_steps is None
+
+
 def test_an_env_made_from_its_own_spec_ends_as_the_first() -> None:
     env = gymnasium.make("arcade_torch/AutoEncodeEasy-v0")
     again = gymnasium.make(env.spec)

@@ -170,6 +170,7 @@ def test_an_env_that_would_be_stepped_wrongly_is_refused(name: str) -> None:
         ({"obs_key": "reward"}, "an entry 'reward', which is a key of the env itself"),
         ({"obs_key": "_step"}, "an entry '_step', which is a key of the env itself"),
         ({"obs_key": 7}, "obs_key is 7, expected a name"),
+        ({"debug": "no"}, "debug is 'no', allowed: True, False"),
         ({"action_spec": Categorical(3, shape=(N, 2))}, r"several choices at once are Bounded\(0"),
         ({"action_spec": MultiCategorical((3, 4), shape=(N, 2))}, "action_spec is a MultiCateg"),
         ({"action_spec": Unbounded((N, 2), dtype=torch.int64)}, "is of integers without bounds"),

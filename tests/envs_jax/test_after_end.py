@@ -137,6 +137,8 @@ def test_rows_of_a_batch_stay_and_begin_anew_when_reset(which):
     following, again = batched.step(fresh, jnp.zeros(ENVS, jnp.int32))
     assert (np.asarray(following.step_count)[mask] == 1).all()
     assert np.array_equal(again.done[~mask], outcome.done[-1][~mask])
+    assert np.asarray(fresh.last_action)[~mask].any()
+    assert not np.asarray(following.last_action).any()
 
 
 @pytest.mark.parametrize("which", few(BATCHES, often=["both"]))

@@ -129,6 +129,7 @@ def test_a_mixture_is_known_by_what_its_games_have_in_common():
             "weights are (1, 0), expected 2 whole numbers of 1 or more",
         ),
         ([StubGame(), CoinGame()], (1.5, 1), "weights are (1.5, 1), expected 2 whole numbers"),
+        ([StubGame(), CoinGame()], (True, 1), "weights are (True, 1), expected 2 whole numbers"),
     ],
 )
 def test_games_that_cannot_share_a_batch_are_refused(games, weights, message):

@@ -1,6 +1,7 @@
 """check_memory passes lawful modules of anybody's, and names the law that a broken one breaks."""
 
 import warnings
+from typing import ClassVar
 
 import pytest
 import torch
@@ -266,6 +267,27 @@ def test_the_module_itself_is_left_alone():
     assert torch.equal(memory.linear.weight, weights) and torch.equal(
         torch.random.get_rng_state(), state
     )
+
+
+class Notes(MinGRU):
+    """Notes what it reads."""
+
+    read: ClassVar[list[torch.Tensor]] = []
+
+    def forward(self, x, state, is_init):
+        self.read.append(x.detach().clone())
+        return super().forward(x, state, is_init)
+
+
+@pytest.mark.parametrize("check", [check_memory, law_results])
+def test_random_inputs_are_those_of_the_seed(check):
+    read = []
+    for seed in (1, 1, 2):
+        Notes.read.clear()
+        check(Notes(3, 4), seed=seed)
+        read.append(Notes.read[0])
+    assert torch.equal(read[0], read[1])
+    assert not torch.equal(read[0], read[2])
 
 
 def test_the_input_size_is_asked_for_when_it_cannot_be_known():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from torch import Tensor, nn
 from torchrl.modules import set_recurrent_mode
 
 pytest.importorskip("sb3_contrib", reason="needs the sb3 extra: pip install '.[sb3]'")
@@ -82,10 +83,27 @@ def test_a_sequence_is_read_as_our_module_reads_it(name: str) -> None:
         torch.testing.assert_close(piece.unflatten(0, (B, last - first)), wanted[:, first:last])
 
 
-@every_memory
-def test_a_state_of_zeros_is_the_initial_one(name: str) -> None:
+class BeginsWithOnes(nn.Module):
+    """A leaky sum."""
+
+    hidden_size = D
+
+    def forward(self, x: Tensor, state: Any, is_init: Tensor) -> tuple[Tensor, TensorDict]:
+        h = state["h"]
+        outputs = []
+        for t in range(x.shape[1]):
+            h = torch.where(is_init[:, t, None], 1.0, h) / 2 + x[:, t]
+            outputs.append(h)
+        return torch.stack(outputs, 1), TensorDict({"h": h}, [len(h)])
+
+    def initial_state(self, batch_size: int) -> TensorDict:
+        return TensorDict({"h": torch.ones(batch_size, D)}, [batch_size])
+
+
+@pytest.mark.parametrize("name", [*memory_names(), BeginsWithOnes])
+def test_a_state_of_zeros_is_the_initial_one(name: Any) -> None:
     """Stable-Baselines3 knows no other; ``predict`` begins without a start flag, too."""
-    flat = FlatMemory(make_memory(name, D, H), D)
+    flat = FlatMemory(make_memory(name, D, H) if isinstance(name, str) else name(), D)
     x = torch.randn(B, T, D)
     no = torch.zeros(B, T, dtype=torch.bool)
     y, _ = flat(x, torch.zeros(B, flat.hidden_size), no)

@@ -259,6 +259,7 @@ def test_the_subject_is_the_headline_and_in_no_closed_fold(root: Path) -> None:
     assert "On the POMDP gru reaches a normalised return of 0.60, the memory-free" in headline
     assert "costs the memory-free agent 0.00 of normalised return and gru" in headline
     assert "and mingru 0.00" not in headline
+    assert "and mlp 0." not in headline  # gap and bias are held against it already
     assert "gru against the others" in page and "minus mingru" in page
 
 

@@ -15,7 +15,7 @@ import pytest
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli, saliency_figure
 from arcade_torch.tools.comparable import find_runs
-from arcade_torch.tools.figures import logs
+from arcade_torch.tools.figures import fonts, logs
 from arcade_torch.tools.figures.catalogue import FIGURES
 from arcade_torch.tools.figures.fonts import save_figure
 from arcade_torch.tools.figures.style import drawing, legend_above, new_figure, svg
@@ -271,3 +271,18 @@ def test_letters_of_other_fonts_are_drawn_and_those_of_none_are_told_in_a_line(
         text = figure.text(0.5, 0.5, "a\u24b6")
         assert save_figure(figure, BytesIO(), format="png") == ""
     assert "STIXGeneral" in text.get_fontfamily()
+
+
+def test_a_picture_that_is_drawn_again_leaves_nothing_of_the_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    drawn = iter([b"with boxes, and longer", b"with letters"])
+
+    def draw(figure: Any, file: BytesIO, options: Any) -> str:
+        file.write(next(drawn))
+        return "\u24b6"
+
+    monkeypatch.setattr(fonts, "_save", draw)
+    file = BytesIO()
+    save_figure(new_figure(), file)
+    assert file.getvalue() == b"with letters"

@@ -285,6 +285,9 @@ def test_an_interval_that_keeps_its_word_is_not_called_narrow() -> None:
     assert "than it claims" in findings.coverage_sentence(few)
     kept = findings.coverage_sentence(replace(few, rows=rows))
     assert "in 95 % of simulated studies." in kept and "than it claims" not in kept
+    rows = tuple(replace(row, coverage=0.91) for row in rows)
+    ninety = findings.coverage_sentence(replace(few, rows=rows, confidence=0.9))
+    assert "nominal 90 %" in ninety and "than it claims" not in ninety
 
 
 def test_the_way_from_random_to_oracle_is_a_share() -> None:
@@ -292,6 +295,10 @@ def test_the_way_from_random_to_oracle_is_a_share() -> None:
         "X", "partial", {"mlp": [0.0, 0.5]}, {"random": 0.0, "state": 1.0}
     )
     assert "mlp 25 %" in said and "a seed of mlp did not get above random" in said
+    above = findings.learning_sentence(
+        "X", "full", {"mlp": [0.5, 0.7]}, {"random": 0.2, "state": 1.0}
+    )
+    assert above.endswith("mlp 50 %, every seed above random.")
     assert findings.learning_sentence("X", "full", {"mlp": [0.1]}, {}) == ""
     for nothing in (math.nan, math.inf, -math.inf):
         assert findings.way(nothing, {"random": 0.0, "state": 1.0}) is None

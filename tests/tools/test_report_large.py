@@ -1,6 +1,7 @@
 """The report of a large study, and what it shows of the inside of agents."""
 
 import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -89,17 +90,45 @@ def test_many_runs_become_small_multiples_and_tables(
     assert "and lru 0.07" in page[first : first + 200] and "The same for every other agent" in page
 
 
-def test_a_large_study_is_looked_into_where_memory_is_furthest_ahead(tmp_path: Path) -> None:
-    folder, study = large_study(tmp_path / "s", seeds=4)
+def looked_into(
+    folder: StudyFolder, study: Study, subject: str = ""
+) -> tuple[Mapping[tuple[str, str, str], Sequence[Path]], str]:
+    """The cells that a report looks into, and its note; every run has a checkpoint, but for the
+    fourth seed of agents with memory.
+    """
     for run in study.runs():
-        (folder.run(run).path / "checkpoints").mkdir()
+        if run.seed < 3 or run.memory == "mlp":
+            (folder.run(run).path / "checkpoints").mkdir()
     runs = Runs(
         tuple(run for spec in study.runs() if (run := open_run(folder.run(spec).path)) is not None)
     )
     finals: dict[tuple[str, str], dict[str, list[float]]] = {}
     for (agent, game, twin), group in runs.groups().items():
         finals.setdefault((game, twin), {})[agent] = [run.value("eval_final") for run in group]
-    cells, note = select_cells(runs, finals, study.baseline)
+    return select_cells(runs, finals, study.baseline, subject)
+
+
+@pytest.mark.parametrize("seeds", [3, 4])
+def test_of_twelve_cells_none_is_left_out(seeds: int, tmp_path: Path) -> None:
+    cells, note = looked_into(*large_study(tmp_path / "s", GAMES[:2], seeds))
+    assert len(cells) == 12 and all(len(paths) == 3 for paths in cells.values())
+    assert (
+        note
+        == {
+            3: "",
+            4: "8 runs without a checkpoint cannot be looked into. "
+            "Shown: the first 3 of 4 seeds of each agent.",
+        }[seeds]
+    )
+
+
+def test_where_all_agents_and_games_are_looked_into_nothing_is_said(tmp_path: Path) -> None:
+    cells, note = looked_into(*large_study(tmp_path / "s", GAMES[:3]), subject="gru")
+    assert len(cells) == 18 and not note
+
+
+def test_a_large_study_is_looked_into_where_memory_is_furthest_ahead(tmp_path: Path) -> None:
+    cells, note = looked_into(*large_study(tmp_path / "s", seeds=4))
     assert {agent for agent, _, _ in cells} == {"mlp", "lru"}
     assert {game for _, game, _ in cells} == {
         "SkittlesEasy-v0",
@@ -125,6 +154,8 @@ def test_representatives_without_a_control_are_the_best_agent() -> None:
         ("B", "partial"): {"pqn-mlp": [0.3], "pqn-lru": [0.9]},
     }
     assert representatives(both, "mlp") == (["pqn-mlp", "pqn-lru"], ["B", "A"])
+    assert representatives(both, "mlp", "pqn-lru") == (["pqn-mlp", "pqn-lru"], ["B", "A"])
+    assert representatives(both, "mlp", "pqn-mlp") == (["pqn-lru", "pqn-mlp"], ["A", "B"])
 
 
 def test_columns_of_the_page_are_those_steps_that_their_headings_name(

@@ -11,6 +11,7 @@ import pytest
 
 from arcade_torch.tools import gap_and_bias, report
 from arcade_torch.tools.measures.bootstrap import Interval
+from arcade_torch.tools.measures.gap_bias.measure import GapBias
 from arcade_torch.tools.measures.gap_bias.pairs import pairs
 from arcade_torch.tools.reports import Part, findings
 from arcade_torch.tools.reports.subject import subject_sentence
@@ -63,7 +64,10 @@ def test_a_gap_below_zero_becomes_lower_or_higher() -> None:
     closed = said(0.2, -0.001)
     assert "lru 0.00" in closed and "memory narrows the observability gap by 0.20" in closed
     assert "memory narrows the observability gap by 0.40" in said(0.5, 0.1)
-    assert "memory widens the observability gap by 0.40" in said(0.1, 0.5)
+    widened = said(0.1, 0.5)
+    assert "memory widens the observability gap by 0.40" in widened
+    near, far = re.findall(r"\[(0\.\d\d), (0\.\d\d)\]", widened)[0]
+    assert float(near) < 0.4 < float(far)
     wide = [10 * more for more in six]
     assert "with memory the gap is 0.10 lower, but" in said(-0.4, -0.5, wide)
     assert "with memory the gap is 0.10 higher, but" in said(-0.5, -0.4, wide)
@@ -101,6 +105,51 @@ def test_of_few_seeds_every_finding_is_of_these_seeds() -> None:
     for name in findings.SENTENCES:
         assert "over these 2 seeds" in findings.score_sentence(gap_and_bias(few), name, "gru")
         assert "over these" not in findings.score_sentence(gap_and_bias(many), name, "gru")
+
+
+def test_a_finding_of_a_single_seed_has_no_interval() -> None:
+    scores = two_agents(gru_full=[0.8], gru_partial=[0.7], mlp_full=[0.5], mlp_partial=[0.2])
+    made = gap_and_bias(scores, draws=50)
+    assert findings.score_sentence(made, "pomdp", "gru").endswith("the memory-free agent 0.20.")
+    assert findings.score_sentence(made, "bias", "gru").endswith("against the memory-free agent.")
+
+
+@pytest.mark.parametrize("fewer", ["gru", "mlp"])
+def test_the_agent_with_fewer_seeds_says_how_sure_a_finding_is(fewer: str) -> None:
+    def made(gru: Sequence[float], mlp: Sequence[float]) -> GapBias:
+        partial = {"gru": gru, "mlp": mlp}
+        partial[fewer] = partial[fewer][:2]
+        returns: dict[str, Sequence[float]] = {}
+        for agent, values in partial.items():
+            returns |= {f"{agent}_full": [0.9] * len(values), f"{agent}_partial": values}
+        return gap_and_bias(two_agents(**returns))
+
+    clear = made([0.8, 0.82] * 4, [0.2, 0.21] * 4)
+    assert "over these 2 seeds memory narrows" in findings.score_sentence(clear, "gap", "gru")
+    assert findings.coverage_sentence(clear).partition(". ")[2].startswith("With 2 seeds")
+    vague = made([0.1, 0.9] * 4, [0.2, 0.8] * 4)
+    assert "so 2 seeds do not settle it" in findings.score_sentence(vague, "gap", "gru")
+
+
+def test_findings_hold_every_memory_against_the_memory_free_agent_of_its_algorithm() -> None:
+    level = {"pqn-mlp": 0.1, "ppo-mlp": 0.2, "pqn-gru": 0.4, "ppo-gru": 0.6}
+    level["dqn-gru"] = 0.9  # there is none of its algorithm: nothing is said
+    made = gap_and_bias(
+        [
+            Score(agent, "CartPoleEasy", twin, seed, value + 0.02 * seed)
+            for agent, value in level.items()
+            for twin in ("full", "partial")
+            for seed in range(2)
+        ],
+        draws=50,
+    )
+    found = findings.score_sentences(made, "")
+    reached = [sentence for sentence in found if sentence.startswith("On the POMDP")]
+    assert len(found) == 6 and len(reached) == 2
+    assert "ppo-gru reaches a normalised return of 0.61, the memory-free agent 0.21" in reached[0]
+    assert "pqn-gru reaches a normalised return of 0.41, the memory-free agent 0.11" in reached[1]
+    about = findings.score_sentences(made, "pqn-gru")
+    assert about == found[3:] + found[:3]
 
 
 def test_the_highest_of_a_row_is_bold_beside_one_that_is_no_number(tmp_path: Path) -> None:

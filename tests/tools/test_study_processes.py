@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -264,6 +265,29 @@ def test_a_worker_that_ignores_the_request_is_killed_after_the_grace_time(tmp_pa
     start = time.monotonic()
     results.close()  # type: ignore[attr-defined]
     assert time.monotonic() - start < 30
+
+
+def test_all_workers_that_ignore_the_request_share_one_grace_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = 0.0
+    given = []
+    wait = processes.Worker.wait
+
+    def wait_in_vain(worker: processes.Worker, grace_s: float) -> None:
+        nonlocal now
+        given.append(grace_s)
+        now += grace_s
+        wait(worker, 0.0)
+
+    clock = SimpleNamespace(monotonic=lambda: now, sleep=time.sleep)
+    engine = python_engine()
+    results = engine.run(jobs(tmp_path, "pass", "import time; time.sleep(60)"))
+    next(results)
+    monkeypatch.setattr(processes, "time", clock)
+    monkeypatch.setattr(processes.Worker, "wait", wait_in_vain)
+    results.close()  # type: ignore[attr-defined]
+    assert given == [engine.grace_s, 0.0]
 
 
 def test_a_worker_stops_when_its_study_is_gone(tmp_path: Path) -> None:

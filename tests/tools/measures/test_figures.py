@@ -21,7 +21,13 @@ from arcade_torch.tools import cli
 from arcade_torch.tools.figures import CurveOptions, PaperOptions, logs
 from arcade_torch.tools.figures.catalogue import FIGURES
 from arcade_torch.tools.figures.logs import Curve
-from arcade_torch.tools.figures.style import AGENT_COLOURS, drawing, new_figure, panels
+from arcade_torch.tools.figures.style import (
+    AGENT_COLOURS,
+    drawing,
+    new_figure,
+    panels,
+    whiskers,
+)
 from arcade_torch.tools.measures import checkpoints
 from arcade_torch.tools.measures.beliefs import figure as beliefs
 from arcade_torch.tools.measures.beliefs.measure import Beliefs
@@ -157,6 +163,26 @@ def test_a_curve_goes_over_the_frames_that_all_its_runs_have_reached_in_the_unit
         assert axis.get_xlabel() == unit and axis.lines[0].get_xdata()[-1] == (
             3 if scale == 1 else 300
         )
+
+
+def test_curves_are_of_the_returns_behind_the_metric(tmp_path: Path) -> None:
+    spec = RunSpec("CartPoleEasy-v0", "full", "lru", "pqn", 0)
+    write_run(tmp_path / "run", spec, 0.5, frames=3_000_000)
+    columns = {
+        "eval_final": ("eval.csv", "mean"),
+        "train_max_ewm": ("metrics.csv", "train_return_ewm"),
+    }
+    for metric, (table, column) in columns.items():
+        with drawing("light"):
+            (picture,) = logs.curves(CurveOptions((tmp_path,), metric=metric), None).pictures
+        last = float(Run(tmp_path / "run").table(table)[-1][column])
+        assert picture.rows[-1]["mean"] == pytest.approx(last), metric
+
+
+def test_an_interval_beside_its_mean_has_one_whisker_and_a_missing_one_none() -> None:
+    """An interval of the bootstrap need not hold the mean; matplotlib takes no length below 0."""
+    value, low, high = (np.array(row) for row in ([1.0, 1.0], [1.25, np.nan], [1.5, np.nan]))
+    np.testing.assert_array_equal(whiskers(value, low, high), [[0, np.nan], [0.5, np.nan]])
 
 
 def test_bars_are_drawn_where_their_numbers_say(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -314,6 +340,7 @@ def test_what_cannot_be_compared_is_refused_in_one_line(
         (["figure", "curves", "--runs", "slow"], "none of the 1 runs below slow has finished"),
         (["figure", "curves", "--runs", "odd"], "does not describe a run"),
         (["figure", "returns", "--paper", "--confidence", "95"], "between 0 and 1"),
+        (["figure", "returns", "--paper", "--confidence", "1"], "between 0 and 1"),
         (["analyze", "gap-bias", "slow", "--paper"], "and these are named: slow; leave"),
         (["figure", "hyperparameters", "slow", "--paper"], "in the place of runs, and these are"),
         (["figure", "returns", "--paper", "--baseline", "gru"], "leave out --baseline"),

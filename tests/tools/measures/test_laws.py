@@ -376,6 +376,7 @@ def test_law_12_identical_seeds_have_no_width_and_the_measured_coverage_stands_o
     assert pooled([0.0, 0.0, 3.0]).mean == 1
     assert np.isnan(pooled(np.ones((1, 2))).low).all()
     assert "no interval" in seeds_note([1], 0.95)
+    assert seeds_note([1, 3], 0.95).startswith("n = 1 to 3 seeds; bars: 95 % bootstrap interval")
 
 
 def test_the_twelve_laws_are_all_here() -> None:
