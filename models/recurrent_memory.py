@@ -148,9 +148,10 @@ class RecurrentMemory(Memory):
             if "Batching rule not implemented" not in str(error):
                 raise
             raise RuntimeError(
-                f"{self._name} knows no vmap, by which GAE and losses with several "
-                "critics read: give GAE deactivate_vmap=True or shifted=True and call it before "
-                "the loss, or take the memory 'gru' or 'lstm', or GRU or LSTM of torchrl.modules"
+                f"{self._name} knows no vmap, by which GAE and losses with several critics read: "
+                "give GAE (or make_value_estimator) and such losses deactivate_vmap=True, or take "
+                "the memory 'gru' or 'lstm', or GRU or LSTM of torchrl.modules. Make the networks "
+                "anew: TorchRL leaves those of this call with weights that nothing else reads"
             ) from error
 
     def _to_module(self, state: TensorDict) -> Any:
