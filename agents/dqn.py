@@ -6,7 +6,9 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
+from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import TargetNetUpdater
+from torchrl.objectives.value import ValueEstimatorBase
 
 from arcade_torch.agents.config import DQNConfig
 from arcade_torch.agents.layout import insert_final_observations, unroll
@@ -25,8 +27,18 @@ class DQNLoss(PQNLoss):
     ``is_init`` set starts from the state stored there.
     """
 
-    def _default_value_estimator(self) -> None:
-        self.make_value_estimator(lmbda=0.0)
+    def make_value_estimator(
+        self, value_type: ValueEstimators | ValueEstimatorBase | None = None, **hyperparams: Any
+    ) -> None:
+        """Choose how targets are made.
+
+        Args:
+            value_type: as in :class:`PQNLoss`.
+            **hyperparams: ``gamma`` (0.99) and ``lmbda`` (0).
+        """
+        if value_type is None:
+            hyperparams = {"lmbda": 0.0} | hyperparams
+        super().make_value_estimator(value_type, **hyperparams)
 
     @torch.no_grad()
     def targets(self, data: TensorDictBase, q: Tensor, steps: int) -> Tensor:

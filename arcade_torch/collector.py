@@ -86,7 +86,7 @@ class ArcadeCollector(BaseCollector):
     Raises:
         TypeError: ``env`` is neither an ``ArcadeEnv`` nor a ``JaxEnv``, or ``policy`` nothing that
             can act.
-        ValueError: Sizes that do not fit, or an unknown choice.
+        ValueError: Sizes that do not fit, an unknown choice, or two memories under one state key.
 
     Example:
         >>> from arcade_torch import make

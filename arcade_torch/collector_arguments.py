@@ -9,7 +9,7 @@ from torchrl.envs.utils import ExplorationType
 from arcade_torch.env import ArcadeEnv
 from arcade_torch.envs_jax.validation import kind_of
 from arcade_torch.jax_env import JaxEnv
-from arcade_torch.policies import path_of
+from arcade_torch.policies import check_state_keys, path_of
 from arcade_torch.rollout_buffer import FinalFrames
 from arcade_torch.validation import whole
 
@@ -79,6 +79,7 @@ def check_arguments(
             f"policy takes the tensor {', '.join(tensors)}, expected one that takes a TensorDict: "
             f"pass TensorDictModule(policy, {tensors}, ['action'])"
         )
+    check_state_keys(policy)
     num_envs = env.num_envs
     if frames_per_batch < num_envs or frames_per_batch % num_envs:
         raise ValueError(

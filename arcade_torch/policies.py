@@ -308,6 +308,26 @@ def _begin_themselves(policy: Any) -> set[NestedKey]:
     return keys
 
 
+def check_state_keys(policy: Any) -> None:
+    """Refuse two memories that have their state under one key (ValueError): each would read what
+    the other has written. Modules that share weights are one memory.
+    """
+    owners: dict[Any, set[nn.Parameter]] = {}
+    for module in _module_of(policy).modules():
+        weights = set(module.parameters())
+        if not weights or not hasattr(module, "make_tensordict_primer"):
+            continue
+        written = {unravel_key(key) for key in getattr(module, "out_keys", ())}
+        for key in map(unravel_key, getattr(module, "in_keys", ())):
+            if unravel_key(("next", key)) not in written:
+                continue
+            if weights.isdisjoint(owners.setdefault(key, weights)):
+                raise ValueError(
+                    f"state_key must be another for each memory of a policy; got two with their "
+                    f"state under {key!r}"
+                )
+
+
 def _varies(primer: TensorDictPrimer) -> bool:
     """Whether a primer gives other values for every episode."""
     given = primer.default_value

@@ -123,13 +123,13 @@ class RecurrentMemory(Memory):
         """See :class:`MemoryContract`."""
         self._check(x, state, is_init)
         if not self._leaves:
-            y, _ = self._read(self.module, x, self._to_module(state))
+            y, _ = self._advance(x, self._to_module(state))
             return y, state.clone()
         fresh = self.initial_state(len(x))
         outputs = []
         for begin, end in pairwise([0, *later_starts(is_init), x.shape[1]]):
             state = fresh.where(is_init[:, begin], state)
-            y, after = self._read(self.module, x[:, begin:end], self._to_module(state))
+            y, after = self._advance(x[:, begin:end], self._to_module(state))
             state = self._from_module(after, len(x))
             outputs.append(y)
         # y may be the same memory
@@ -139,6 +139,20 @@ class RecurrentMemory(Memory):
         """See :class:`ReplayableMemory`."""
         self._check(x, stored, is_init, batch_ndim=2)
         return replay_by_steps(self, x, stored, is_init)
+
+    def _advance(self, x: Tensor, state: Any) -> tuple[Tensor, Any]:
+        """Run the module; say what to do where torch has no ``vmap`` rule for it."""
+        try:
+            return self._read(self.module, x, state)
+        except RuntimeError as error:
+            if "Batching rule not implemented" not in str(error):
+                raise
+            raise RuntimeError(
+                f"{self._name} knows no vmap, by which GAE and losses with several critics read: "
+                "give GAE (or make_value_estimator) and such losses deactivate_vmap=True, or take "
+                "the memory 'gru' or 'lstm', or GRU or LSTM of torchrl.modules. Make the networks "
+                "anew: TorchRL leaves those of this call with weights that nothing else reads"
+            ) from error
 
     def _to_module(self, state: TensorDict) -> Any:
         """A state as the module has it."""

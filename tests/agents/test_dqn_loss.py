@@ -28,6 +28,17 @@ def test_targets_are_one_step_targets_unless_told_otherwise():
     torch.testing.assert_close(loss(s.sequences())["loss"].detach(), error, atol=1e-5, rtol=1e-5)
 
 
+def test_targets_stay_those_of_one_step_where_gamma_alone_is_given():
+    """Before: ``make_value_estimator(gamma=...)`` took PQN's lambda of 0.95, in silence."""
+    network, s = toy_network(), stream(4, 8, seed=1)
+    wanted = s.reward + GAMMA * play(network, s)[1].amax(-1) * ~s.terminated
+    loss = DQNLoss(network)
+    for kind in ((), (None,)):
+        loss.make_value_estimator(*kind, gamma=GAMMA)
+        target = look_into(loss, s.sequences())[1]
+        torch.testing.assert_close(target, wanted, atol=1e-5, rtol=1e-5)
+
+
 def test_stored_targets_are_used_as_they_are():
     network, s = toy_network(), stream(3, 7, seed=4)
     loss, target = make_loss(network), torch.randn(3, 7)

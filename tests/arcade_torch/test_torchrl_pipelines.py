@@ -1,6 +1,7 @@
 """TorchRL's own parts take the env and the collector as they are."""
 
 import copy
+import re
 from typing import Any
 
 import pytest
@@ -24,6 +25,7 @@ from torchrl.objectives.value import GAE
 
 from arcade_torch.collector import ArcadeCollector
 from arcade_torch.env import ArcadeEnv
+from arcade_torch.models import MemoryModule, make_memory
 from tests.arcade_torch.same import assert_same
 from tests.arcade_torch.stub import GAME
 
@@ -94,6 +96,30 @@ def test_a_module_without_its_primer_is_explained() -> None:
         KeyError, match=r"the policy reads 'memory' and writes it .* make_tensordict_primer"
     ):
         ArcadeCollector(stub_env(), module, N * T).collect()
+
+
+def critic_of(policy: TensorDictSequential, memory: nn.Module) -> TensorDictSequential:
+    """A critic that reads the features of a policy with a memory."""
+    return TensorDictSequential(policy[0], memory, ValueOperator(nn.Linear(8, 1), ["hidden"]))
+
+
+@pytest.mark.parametrize("kind", ["gru of torchrl", "memory module"])
+def test_two_memories_under_one_key_are_refused(kind: str) -> None:
+    """As actor and critic have by default. Before: each read the state that the other had written,
+    in silence.
+    """
+    policy = recurrent_policy()
+    if kind == "memory module":
+        one, other = (MemoryModule(make_memory("gru", 8, 8), "features", "hidden") for _ in "12")
+        policy = TensorDictSequential(policy[0], one, *policy[2:])
+    else:
+        one, other = policy[1], recurrent_policy()[1]
+    key = repr(one.in_keys[1])
+    with pytest.raises(ValueError, match=rf"^state_key must be another .* under {re.escape(key)}"):
+        ArcadeCollector(stub_env(), TensorDictSequential(critic_of(policy, other), policy), N * T)
+    for same in (one, torch.compile(one), copy.copy(one)):  # one memory, and its state is one
+        both = TensorDictSequential(critic_of(policy, same), policy)
+        ArcadeCollector(stub_env(), both, N * T)
 
 
 def test_a_resumed_recurrent_policy_goes_on_to_the_bit(tmp_path: Any) -> None:

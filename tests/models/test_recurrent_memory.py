@@ -332,6 +332,21 @@ def test_several_read_at_once_with_their_own_starts() -> None:
         torch.testing.assert_close(together[number], y)
 
 
+@pytest.mark.parametrize("module", [nn.RNN(D, H), nn.GRU(D, H, batch_first=True), nn.LSTM(D, H, 2)])
+def test_a_module_that_knows_no_vmap_is_told_with_what_reads_without(module: nn.Module) -> None:
+    """By which ``GAE`` and losses of two critics read. Before: an error of torch about ``aten``."""
+    memory = RecurrentMemory(module, D, H)
+    x, flags = torch.zeros(2, 3, 5, D), torch.zeros(3, 5, dtype=torch.bool)
+    says = rf"^{type(module).__name__} knows no vmap.*deactivate_vmap=True"
+    with pytest.raises(RuntimeError, match=says) as info:
+        torch.func.vmap(lambda x: memory(x, memory.initial_state(3), flags)[0])(x)
+    assert "\n" not in str(info.value)
+    other = RecurrentMemory(Stepwise(), D, H)
+    other.module.linear = nn.Linear(D + 1, H)
+    with pytest.raises(RuntimeError, match="shapes cannot be multiplied"):  # torch's own, as it is
+        other(x[0], other.initial_state(3), flags)
+
+
 def test_to_make_one_changes_neither_the_module_nor_random_numbers() -> None:
     module = nn.LSTM(D, H, num_layers=2, dropout=0.5)
     before = torch.random.get_rng_state()
