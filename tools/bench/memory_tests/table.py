@@ -113,14 +113,14 @@ def columns(rows: Sequence[Row]) -> list[tuple[MemoryTest, int]]:
     return pairs
 
 
-def cells(rows: Sequence[Row], confidence: float = 0.95) -> dict[tuple[str, str, int], Cell]:
-    """Model, test and size -> the mean over seeds, with its interval."""
+def cells(rows: Sequence[Row]) -> dict[tuple[str, str, int], Cell]:
+    """Model, test and size -> the mean over seeds, with its 95 % interval."""
     shares: dict[tuple[str, str, int], list[float]] = {}
     for row in rows:
         shares.setdefault((row.model, row.test, row.level), []).append(row.accuracy)
     table = {}
     for key, values in shares.items():
-        over_seeds = pooled(values, confidence)
+        over_seeds = pooled(values)
         chance = float(TESTS[key[1]].chance)
         mean = float(over_seeds.mean)
         ends = (float(over_seeds.low), float(over_seeds.high))
