@@ -11,8 +11,8 @@ from arcade_torch.agents.differences import differing_fields, flatten
 from arcade_torch.agents.runs.files import (
     is_final,
     list_checkpoints,
-    read_csv,
     read_json,
+    read_log,
     wrong_mean,
 )
 from arcade_torch.tools.imports import remembered_imports
@@ -101,7 +101,7 @@ class Run:
         file = self.path / name
         if not file.exists():
             return []
-        return read_csv(file, strict=False)
+        return read_log(file)
 
     @cached_property
     def key(self) -> AgentKey:

@@ -357,7 +357,7 @@ class CsvLog:
     def __init__(self, path: Path, columns: Sequence[str], keep_frames: int = 0) -> None:
         self.path = path
         self.columns = list(columns)
-        rows = read_csv(path, strict=False) if path.exists() else []
+        rows = read_log(path) if path.exists() else []
         kept = [
             [row.get(name, "") for name in columns]
             for row in rows
@@ -382,45 +382,62 @@ class CsvLog:
             self._stream.close()
 
 
-def read_csv(path: Path, strict: bool = True) -> list[dict[str, str]]:
+def read_csv(path: Path) -> list[dict[str, str]]:
     """Rows of a table with a header.
-
-    Args:
-        path: the file.
-        strict: refuse a line of another length; else the file is a log, its first column is
-            ``frames``, and unfinished or damaged lines are left out.
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: it is no text, has no header or a name twice in it, or has such a line.
+        ValueError: it is no text, has no header or a name twice in it, or has a line of another
+            length.
+    """
+    lines = _read_cells(path, "not CSV in UTF-8")
+    if not lines:
+        raise ValueError(f"{path} is empty: expected CSV with a header line")
+    header, *rows = lines
+    on_one_line = all(name.splitlines() in ([name], []) for name in header)
+    if len(set(header)) != len(header) or not on_one_line:
+        raise ValueError(f"{path} has a header that names a column twice, or over several lines")
+    for row in rows:
+        if len(row) != len(header):
+            which = "more" if len(row) > len(header) else "fewer"
+            raise ValueError(
+                f"{path} has a line with {which} cells than its header names{_divided(header)}"
+            )
+    return [dict(zip(header, row, strict=True)) for row in rows]
+
+
+def read_log(path: Path) -> list[dict[str, str]]:
+    """Rows of a table that a `CsvLog` adds to; lines that are unfinished or damaged are left out.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is no text, or its first column is not ``frames``.
+    """
+    lines = _read_cells(path, "damaged, it is no table", unfinished=False)
+    if not lines:
+        return []
+    header, *rows = lines
+    if header[0] != "frames" or header.count("frames") != 1:
+        raise ValueError(f"{path} is damaged: its first line does not begin with 'frames'")
+    whole = []
+    for row in rows:
+        if len(row) == len(header) and re.fullmatch("[0-9]{1,15}", row[0]):
+            whole.append(dict(zip(header, row, strict=True)))
+    return whole
+
+
+def _read_cells(path: Path, wrong: str, unfinished: bool = True) -> list[list[str]]:
+    """The cells of all lines that are not empty; with a last one that is ``unfinished``, or
+    without.
     """
     try:
         text = read_text(path)
         _check_size(path, text)
-        text = text if strict else text[: text.rfind("\n") + 1]
-        header, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row] or [[]]
+        if not unfinished:
+            text = text[: text.rfind("\n") + 1]
+        return [row for row in csv.reader(io.StringIO(text, newline="")) if row]
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(
-            f"{path} is {'not CSV in UTF-8' if strict else 'damaged, it is no table'}: {error}"
-        ) from error
-    if not strict:
-        if header and (header.count("frames") != 1 or header[0] != "frames"):
-            raise ValueError(f"{path} is damaged: its first line does not begin with 'frames'")
-        rows = [
-            row for row in rows if len(row) == len(header) and re.fullmatch("[0-9]{1,15}", row[0])
-        ]
-    elif not header:
-        raise ValueError(f"{path} is empty: expected CSV with a header line")
-    elif len(set(header)) != len(header) or any(
-        name.splitlines() not in ([name], []) for name in header
-    ):
-        raise ValueError(f"{path} has a header that names a column twice, or over several lines")
-    elif wrong := next((row for row in rows if len(row) != len(header)), None):
-        which = "more" if len(wrong) > len(header) else "fewer"
-        raise ValueError(
-            f"{path} has a line with {which} cells than its header names{_divided(header)}"
-        )
-    return [dict(zip(header, row, strict=True)) for row in rows]
+        raise ValueError(f"{path} is {wrong}: {error}") from error
 
 
 def _divided(header: Sequence[str]) -> str:
