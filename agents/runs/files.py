@@ -8,7 +8,6 @@ import errno
 import hashlib
 import io
 import json
-import math
 import os
 import re
 import secrets
@@ -29,12 +28,6 @@ MOST_TENSORS = 16 * 2**30
 """Bytes of the largest file of tensors that is read."""
 LATEST = "latest"
 """File in ``checkpoints/`` with the name of the newest."""
-MEAN_TOLERANCE = 1e-5
-"""A mean in float32 may differ from that of its returns in float64 by this share of the largest."""
-MOST_COUNT = 1e15
-"""The largest number of frames, steps or seconds of a run."""
-MOST_RETURN = 3.5e38
-"""Above the largest finite return, which has single precision."""
 _END_BYTES = 2**16
 _OUR_NAMES = {
     "draft": re.compile(r"\..{1,40}\.\d+-[0-9a-f]{8}\.draft", re.DOTALL),
@@ -80,7 +73,7 @@ def is_inside(folder: Path, name: str) -> bool:
     return not any(place.is_symlink() for place in places)
 
 
-def open_regular(path: Path, most_bytes: int | None = MOST_TEXT) -> BinaryIO:
+def open_regular(path: Path, most_bytes: int | None) -> BinaryIO:
     """Open a file for reading, if it is a regular one of a size that can be meant.
 
     What is opened is looked at, so that nothing can take its place in between; nothing is waited
@@ -240,7 +233,9 @@ def _make_folder(path: Path) -> None:
 
 def remove_drafts(folder: Path) -> None:
     """Remove what :func:`write_atomic` of a killed process left in a folder, and nothing else."""
-    for path in folder.iterdir() if folder.is_dir() else ():
+    if not folder.is_dir():
+        return
+    for path in folder.iterdir():
         if is_ours(path, "draft"):
             path.unlink(missing_ok=True)
 
@@ -286,67 +281,6 @@ def latest_name(folder: Path) -> str:
     except (OSError, ValueError):
         return ""
     return name if is_our_name(name, "checkpoint") else ""
-
-
-def is_final(values: Any, needed: Sequence[str] = ()) -> bool:
-    """Whether ``values``, with all ``needed`` keys, is what the ``eval.json`` of a finished run
-    holds.
-    """
-    if not isinstance(values, dict) or not set(needed) <= set(values):
-        return False
-    if values.get("status", "finished") != "finished":
-        return False
-    returns = values.get("returns", [])
-    lengths = values.get("lengths", [])
-    if not isinstance(returns, list) or not isinstance(lengths, list):
-        return False
-    has_mean = values["mean"] is not None if "mean" in values else bool(returns)
-    if not has_mean:
-        return False
-
-    counts = [*lengths, *_present(values, "n", "frames", "seconds")]
-    scores = [*returns, *_present(values, "mean", "std", "ci", "train_max_ewm")]
-    if not all(_is_real(n, MOST_COUNT) for n in counts):
-        return False
-    # an evaluation whose returns are infinite is one, and would be so again
-    if not all(_is_real(n, MOST_RETURN) or n in (math.inf, -math.inf) for n in scores):
-        return False
-
-    are_whole = all(type(length) is int for length in lengths)
-    are_pairs = 0 < len(returns) == len(lengths) or not {"returns", "lengths"} <= set(values)
-    is_negative = any((values.get(name) or 0) < 0 for name in ("frames", "seconds"))
-    return are_whole and are_pairs and not is_negative and not wrong_mean(values)
-
-
-def _present(values: Mapping[str, Any], *names: str) -> list[Any]:
-    """What stands under some names, without what is missing or None."""
-    return [values[name] for name in names if values.get(name) is not None]
-
-
-def _is_real(value: Any, most: float) -> bool:
-    """Whether a value is a number up to a size, so that it can be squared; NaN is one."""
-    return type(value) in (int, float) and not abs(value) > most
-
-
-def wrong_mean(values: Any) -> str:
-    """In what the mean of an ``eval.json`` is not that of its returns; empty if it is, or what
-    stands there are no numbers.
-    """
-    if not isinstance(values, dict) or "mean" not in values or not values.get("returns"):
-        return ""
-    try:
-        mean = float(values["mean"])
-        returns = list(map(float, values["returns"]))
-        actual = math.fsum(returns) / len(returns)
-        size = max(1.0, *map(abs, returns))
-    except (TypeError, ValueError, OverflowError):
-        return ""
-    is_equal = mean == actual  # of infinities
-    if math.isfinite(size):
-        is_equal = abs(mean - actual) <= MEAN_TOLERANCE * size  # no number is equal to NaN
-    if is_equal or (math.isnan(mean) and math.isnan(actual)):
-        return ""
-    return f"its mean is {mean:g}, but that of its {len(returns)} returns is {actual:g}"
 
 
 class CsvLog:

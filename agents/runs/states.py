@@ -40,10 +40,8 @@ def check_state(saved: Any, expected: Any, name: str = "the state") -> None:
         for index, (one, other) in enumerate(zip(saved, expected, strict=False)):
             check_state(one, other, f"{name}[{index}]")
     elif isinstance(expected, Tensor):
-        same = isinstance(saved, Tensor) and (saved.dtype, saved.shape) == (
-            expected.dtype,
-            expected.shape,
-        )
+        _require(isinstance(saved, Tensor), name, saved, _described(expected))
+        same = (saved.dtype, saved.shape) == (expected.dtype, expected.shape)
         _require(same, name, saved, _described(expected))
     else:
         _check_value(saved, expected, name)
@@ -102,13 +100,9 @@ def _described(value: Any) -> str:
         return f"{kind_of(value)} of {len(value)}"
     if isinstance(value, str):
         return repr(value[:40])
-    if (
-        value is None
-        or isinstance(value, bool | float)
-        or (isinstance(value, int) and abs(value) < LARGEST)
-    ):
-        return repr(value)
-    return kind_of(value)
+    if isinstance(value, int) and abs(value) >= LARGEST:
+        return kind_of(value)
+    return repr(value) if isinstance(value, int | float | None) else kind_of(value)
 
 
 def _require(fits: bool, name: str, saved: Any, allowed: str) -> None:
