@@ -254,19 +254,11 @@ class Trainer:
             self.frames = state["frames"]
             self.updates = state["updates"]
             self.seconds = state["seconds"]
-            require(
-                self.frames == checkpoint.frames,
-                "frames",
-                self.frames,
-                f"{checkpoint.frames}, as in its name",
-            )
+            allowed = f"{checkpoint.frames}, as in its name"
+            require(self.frames == checkpoint.frames, "frames", self.frames, allowed)
             updated_frames = self.updates * self.config.learner.frames_per_update
-            require(
-                self.frames == updated_frames,
-                "updates",
-                self.updates,
-                f"as many as make {self.frames} frames",
-            )
+            allowed = f"as many as make {self.frames} frames"
+            require(self.frames == updated_frames, "updates", self.updates, allowed)
         except CheckpointError:
             raise
         except Exception as error:  # whatever a damaged state leads to, it is not to be used

@@ -34,9 +34,8 @@ def check_state(saved: Any, expected: Any, name: str = "the state") -> None:
             check_state(saved[key], expected[key], f"{name}[{key!r}]")
     elif isinstance(expected, list | tuple):
         _require(isinstance(saved, list | tuple), name, saved, "a list")
-        _require(
-            not expected or len(saved) == len(expected), name, saved, f"a list of {len(expected)}"
-        )
+        fits = not expected or len(saved) == len(expected)
+        _require(fits, name, saved, f"a list of {len(expected)}")
         for index, (one, other) in enumerate(zip(saved, expected, strict=False)):
             check_state(one, other, f"{name}[{index}]")
     elif isinstance(expected, Tensor):
@@ -64,19 +63,11 @@ def check_optimizer(saved: Any, parameters: Sequence[nn.Parameter]) -> None:
     a ``ValueError``.
     """
     name = "the state['optimizer']"
-    _require(
-        isinstance(saved, Mapping) and isinstance(saved.get("state"), Mapping),
-        name,
-        saved,
-        "one of an optimiser",
-    )
+    is_state = isinstance(saved, Mapping) and isinstance(saved.get("state"), Mapping)
+    _require(is_state, name, saved, "one of an optimiser")
     for index, averages in saved["state"].items():
-        _require(
-            type(index) is int and 0 <= index < len(parameters),
-            name,
-            index,
-            "numbers of parameters",
-        )
+        is_place = type(index) is int and 0 <= index < len(parameters)
+        _require(is_place, name, index, "numbers of parameters")
         part = f"{name}[{index}]"
         complete = isinstance(averages, Mapping) and set(averages) == _MOMENTS
         _require(complete, part, averages, f"a table of {', '.join(sorted(_MOMENTS))}")
