@@ -28,12 +28,10 @@ SCRIPTED = ("random", "state-oracle", "frames-oracle")
 FASTEST_FPS = {".gif": 50, ".mp4": 240}  # a GIF shows a frame for 2 hundredths of a second or more
 # Quality of x264: 0 is lossless, 23 its default. Most players want this pixel format.
 _ENCODING = ("-c:v", "libx264", "-crf", "14", "-pix_fmt", "yuv420p", "-movflags", "+faststart")
+# of films of a training
 FILM_FPS = 10
 FILM_STEPS = 500
-FILM_SEED = 2**31
-"""Of films of a training. The seed is far from those of training and always the same, so that films
-compare.
-"""
+FILM_SEED = 2**31  # far from those of training, and always the same, so that films compare
 GAP = 8
 """Between pictures on a sheet or a strip, in pixels."""
 

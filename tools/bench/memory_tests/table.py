@@ -18,10 +18,9 @@ __all__ = ["BEGIN", "END", "Cell", "Row", "cells", "columns", "markdown", "measu
 BEGIN = "<!-- memory tests -->"
 END = "<!-- end of memory tests -->"
 
-SOLVED = 0.95
-AT_CHANCE = 0.05
-"""Of the share of what a guess misses, the mean over seeds: from here on solved; up to here
-chance."""
+# of what a guess misses, the share that is right, as a mean over seeds
+SOLVED = 0.95  # from here on
+AT_CHANCE = 0.05  # up to here
 
 
 class Row(NamedTuple):
