@@ -112,9 +112,8 @@ class LearnerConfig(Checked):
         rows = getattr(self, self.SPLIT)
         allowed = f"a divisor of {self.SPLIT}={rows}: whole sequences go into a minibatch"
         self._require(rows % self.minibatches == 0, "minibatches", allowed)
-        self._require(
-            self.steps_before <= self.num_steps, "overlap", f"at most num_steps={self.num_steps}"
-        )
+        allowed = f"at most num_steps={self.num_steps}"
+        self._require(self.steps_before <= self.num_steps, "overlap", allowed)
 
     @property
     def steps_before(self) -> int:
@@ -261,20 +260,13 @@ class DQNConfig(QConfig):
         super().__post_init__()
         length = self.overlap + self.num_steps
         self._require(self.burn_in < length, "burn_in", f"less than overlap + num_steps = {length}")
-        self._require(
-            self.targets != "stored" or not self.target_every,
-            "target_every",
-            "0 with targets='stored'",
-        )
-        held = self.replay_sequences
+        is_one_network = self.targets != "stored" or not self.target_every
+        self._require(is_one_network, "target_every", "0 with targets='stored'")
         needed = max(self.batch_sequences, self.learning_starts, self.num_envs)
         windows = -(-needed // self.num_envs)
         frames = windows * self.num_envs * length
-        self._require(
-            held >= needed,
-            "replay_frames",
-            f">= {frames}, room for {needed} sequences of {length} frames",
-        )
+        allowed = f">= {frames}, room for {needed} sequences of {length} frames"
+        self._require(self.replay_sequences >= needed, "replay_frames", allowed)
 
     @property
     def replay_sequences(self) -> int:

@@ -22,7 +22,7 @@ def differing_fields(
 
 
 def differing_values(
-    one: Settings, other: Settings, free: Iterable[str] = RESUME_MAY_CHANGE
+    one: Settings, other: Settings, free: Iterable[str]
 ) -> dict[str, tuple[Any, Any]]:
     """The settings in which two runs differ: dotted name -> both values.
 

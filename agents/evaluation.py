@@ -148,12 +148,8 @@ def evaluate(
     _check_players(agent, env)
     episodes = _count(episodes)
     held_out_seed(seed)  # before anything is compiled
-    require(
-        observability in (None, "full", "partial"),
-        "observability",
-        observability,
-        "'full' or 'partial'",
-    )
+    is_twin = observability in (None, "full", "partial")
+    require(is_twin, "observability", observability, "'full' or 'partial'")
     require(env is None or game is None, "game", game, "left out where env is given")
     if env is None:
         config = agent.config if game is None else replace(agent.config, env=resolve_id(game))

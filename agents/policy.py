@@ -93,15 +93,14 @@ def make_actor(network: TensorDictModuleBase, deterministic: bool = False) -> Pr
     """
     _check_writes(network, "logits")
     deterministic = coerce("deterministic", plain(deterministic), bool)
+    kind = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     return ProbabilisticActor(
         network,
         in_keys=["logits"],
         distribution_class=Choice,
         distribution_kwargs={"validate_args": False},
         return_log_prob=True,
-        default_interaction_type=ExplorationType.DETERMINISTIC
-        if deterministic
-        else ExplorationType.RANDOM,
+        default_interaction_type=kind,
     )
 
 
@@ -325,7 +324,7 @@ def _new_network(config: TrainConfig) -> Network:
     return network
 
 
-def compile_network(network: nn.Module, backend: str = "inductor") -> None:
+def compile_network(network: nn.Module, backend: str) -> None:
     """Compile encoders, memories and heads in place, also for losses that hold them; weights keep
     their names.
     """

@@ -108,12 +108,9 @@ class PQNLoss(NetworkLoss):
         else:
             require(not delay_value, "functional", functional, "True with delay_value")
             self.value_network = value_network
-        require(
-            not burn_in or len(self.inputs.stores) < 2,
-            "burn_in",
-            burn_in,
-            "0 with memories that differ in store",
-        )
+        may_burn_in = len(self.inputs.stores) < 2
+        allowed = "0 with memories that differ in store"
+        require(may_burn_in or not burn_in, "burn_in", burn_in, allowed)
         self.time_limit = coerce("time_limit", time_limit, TimeLimit)
         self.bootstrap = coerce("bootstrap", bootstrap, Bootstrap)
         self.delay_value = delay_value

@@ -22,7 +22,11 @@ _SMALL_Q = {
     "lr_decay_fraction": 1.0,
     "exploration_fraction": 0.4,
 }
-_SMALL_REPLAY = {
+_SMALL_PQN = _SMALL_Q | {"epochs": 2, "learning_rate": 5e-4, "learning_rate_end": 5e-6}
+_SMALL_DQN = _SMALL_Q | {
+    "epochs": 1,
+    "learning_rate": 1e-3,
+    "learning_rate_end": 5e-5,
     "replay_frames": 100_000,
     "batch_sequences": 128,
     "learning_starts": 256,
@@ -34,12 +38,11 @@ _SMALL_PPO = {
     "learning_rate": 1e-3,
     "learning_rate_end": 5e-5,
     "average_share": 0.1,
-}
-_SMALL_PPO |= {
     "entropy_coeff": 0.1,
     "entropy_end": 0.001,
     "critic_coeff": 4.0,
     "advantage_decay": 0.99,
+    "prediction_coeff": 1.0,
 }
 # an action is paid in the step it is taken
 _AT_ONCE = ("AutoEncode", "BattleShip", "CountRecall", "MineSweeper")
@@ -77,25 +80,24 @@ _PRESETS: dict[str, dict[str, Any]] = {
         "threads": 1,
         "eval_every": 250_000,
         "checkpoint_every": 50_000,
-        "pqn": _SMALL | _SMALL_Q | {"epochs": 2, "learning_rate": 5e-4, "learning_rate_end": 5e-6},
-        "ppo": _SMALL | _SMALL_PPO | {"prediction_coeff": 1.0},
-        "dqn": _SMALL
-        | _SMALL_Q
-        | {"epochs": 1, "learning_rate": 1e-3, "learning_rate_end": 5e-5}
-        | _SMALL_REPLAY,
+        "pqn": _SMALL | _SMALL_PQN,
+        "ppo": _SMALL | _SMALL_PPO,
+        "dqn": _SMALL | _SMALL_DQN,
+    },
+    "smoke": {
+        "algorithm": "pqn",
+        "network": "small",
+        "memory": "mingru",
+        "total_frames": 512,
+        "threads": 1,
+        "eval_every": 0,
+        "eval_episodes": 4,
+        "checkpoint_every": 128,
+        "pqn": _SMALL | _SMALL_PQN | _TINY,
+        "ppo": _SMALL | _SMALL_PPO | _TINY,
+        "dqn": _SMALL | _SMALL_DQN | _TINY | _TINY_REPLAY,
     },
 }
-_PRESETS["smoke"] = _PRESETS["small"] | {
-    group: _PRESETS["small"][group] | _TINY for group in GROUPS
-}
-_PRESETS["smoke"]["dqn"] |= _TINY_REPLAY
-_PRESETS["smoke"] |= {
-    "algorithm": "pqn",
-    "memory": "mingru",
-    "total_frames": 512,
-    "checkpoint_every": 128,
-}
-_PRESETS["smoke"] |= {"eval_every": 0, "eval_episodes": 4}
 
 
 def preset_names() -> list[str]:

@@ -84,7 +84,7 @@ def read_shared(folder: Path, sha256: str | None = None) -> Checkpoint:
     return _with_known_memory(load_bundle(folder, sha256), folder)
 
 
-def read_fetched(folder: Path, sha256: str | None = None) -> Checkpoint:
+def read_fetched(folder: Path, sha256: str | None) -> Checkpoint:
     """What :func:`arcade_torch.agents.hub.download` put into a folder of the hub's cache, where it
     stays, damaged or not; raises as :func:`from_pretrained`.
     """

@@ -147,13 +147,9 @@ class SequenceReplay:
         """Go back to a saved moment; a ``CheckpointError`` if a file is missing or damaged."""
         if not isinstance(state, Mapping) or not isinstance(state.get("files"), Mapping):
             raise CheckpointError("the checkpoint does not name the windows of a replay")
-        require(
-            type(state["added"]) is int and 0 <= state["added"] < 10**12,
-            "added",
-            state["added"],
-            "a count",
-        )
-        self._added = state["added"]
+        added = state["added"]
+        require(type(added) is int and 0 <= added < 10**12, "added", added, "a count")
+        self._added = added
         self._segments.clear()
         for name, digest in state["files"].items():
             if not is_our_name(name, "window"):

@@ -68,11 +68,9 @@ class Trainer:
         check_config(config)
         self.config = config
         device, _ = pick_devices(config.device)  # refused here if it is not there
-        self.random = (
-            torch.cuda.default_generators[device.index]
-            if device.type == "cuda"
-            else torch.default_generator
-        )
+        self.random = torch.default_generator
+        if device.type == "cuda":
+            self.random = torch.cuda.default_generators[device.index]
         generator = torch.Generator(self.random.device).manual_seed(config.seed)
         self.random_state = generator.get_state()
         with self._own_settings():
@@ -85,8 +83,10 @@ class Trainer:
         self.network = build_network(config)  # learns
         # acts, is evaluated and saved: a mean of the weights, or the network that learns itself
         self.acting = build_network(config) if numbers.average_share else self.network
-        for network in {self.network, self.acting} if config.compile else ():
-            compile_network(network, COMPILE_BACKEND)
+        self.networks = {self.network, self.acting}  # one, or two
+        if config.compile:
+            for network in self.networks:
+                compile_network(network, COMPILE_BACKEND)
         self.total_frames = config.num_updates * numbers.frames_per_update
         self.shuffle = torch.Generator().manual_seed(config.seed + 1)
         training = Training(
@@ -143,21 +143,21 @@ class Trainer:
         """Random play before training: fills the overlap and calibrates the input scaling; not
         counted as frames.
         """
-        with self._own_settings():
-            self._warm_up()
-
-    def _warm_up(self) -> None:
         numbers = self.config.learner
         # the first window fills the overlap too
         steps = max(0, numbers.warmup_steps - numbers.steps_before)
         windows = -(-steps // numbers.num_steps)
+        if not windows:
+            return
         stride = max(1, numbers.frames_per_update * windows // 3200)  # 3,200 frames are plenty
         seen = []
-        for _ in range(windows):
-            pixels = self.collector.collect(random=True).get("pixels")[:, numbers.steps_before :]
-            seen.append(pixels.flatten(0, 1)[::stride].clone())
-        for network in {self.network, self.acting} if seen else ():
-            network.calibrate(torch.cat(seen))
+        with self._own_settings():
+            for _ in range(windows):
+                batch = self.collector.collect(random=True)
+                pixels = batch["pixels"][:, numbers.steps_before :]
+                seen.append(pixels.flatten(0, 1)[::stride].clone())
+            for network in self.networks:
+                network.calibrate(torch.cat(seen))
 
     def update(self) -> dict[str, Any]:
         """Collect one window and learn from it; returns a row of ``metrics.csv``.
@@ -179,9 +179,9 @@ class Trainer:
         if not self.ends_in_time:
             check_ends(self.env.game, int(batch["step_count"].max()))
         new = slice(numbers.steps_before, None)
-        last = self.stats.update(
-            *(batch["next", key][:, new].squeeze(-1) for key in ("episode_reward", "done"))
-        )
+        returns = batch["next", "episode_reward"][:, new].squeeze(-1)
+        done = batch["next", "done"][:, new].squeeze(-1)
+        last = self.stats.update(returns, done)
         try:
             if not bool(batch["next", "reward"].isfinite().all()):
                 raise NonFiniteError("a reward is not finite")
@@ -214,11 +214,17 @@ class Trainer:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything but the weights that the rest of the run depends on."""
-        collector = self.collector.state_dict()
-        collector.pop("policy_state_dict", None)
         return {
             **self.learner.state_dict(),
             "network": None if self.network is self.acting else self.network.state_dict(),
+            **self._own_state(),
+        }
+
+    def _own_state(self) -> dict[str, Any]:
+        """The part of the state that is neither the learner's nor weights."""
+        collector = self.collector.state_dict()
+        collector.pop("policy_state_dict", None)
+        return {
             "explore": self.random_state,
             "shuffle": self.shuffle.get_state(),
             "collector": collector,
@@ -248,19 +254,11 @@ class Trainer:
             self.frames = state["frames"]
             self.updates = state["updates"]
             self.seconds = state["seconds"]
-            require(
-                self.frames == checkpoint.frames,
-                "frames",
-                self.frames,
-                f"{checkpoint.frames}, as in its name",
-            )
+            allowed = f"{checkpoint.frames}, as in its name"
+            require(self.frames == checkpoint.frames, "frames", self.frames, allowed)
             updated_frames = self.updates * self.config.learner.frames_per_update
-            require(
-                self.frames == updated_frames,
-                "updates",
-                self.updates,
-                f"as many as make {self.frames} frames",
-            )
+            allowed = f"as many as make {self.frames} frames"
+            require(self.frames == updated_frames, "updates", self.updates, allowed)
         except CheckpointError:
             raise
         except Exception as error:  # whatever a damaged state leads to, it is not to be used
@@ -273,20 +271,9 @@ class Trainer:
         """What a saved state of this trainer looks like; the replay, which looks at its files
         itself, is left out.
         """
-        collector = self.collector.state_dict()
-        collector.pop("policy_state_dict", None)
         learner = Learner.state_dict(self.learner)
         learner.pop("optimizer")  # looks at its averages itself, and keeps its own options
-        counters = dict.fromkeys(("learner_updates", "frames", "updates"), 0)
-        return {
-            **learner,
-            **counters,
-            "explore": self.random_state,
-            "shuffle": self.shuffle.get_state(),
-            "collector": collector,
-            "stats": self.stats.state_dict(),
-            "seconds": 0.0,
-        }
+        return {**learner, "learner_updates": 0, **self._own_state()}
 
     def close(self) -> None:
         """Let go of the environments."""

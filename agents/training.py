@@ -25,7 +25,7 @@ from arcade_torch.agents.learner import NonFiniteError
 from arcade_torch.agents.metrics import paper_score
 from arcade_torch.agents.policy import Agent
 from arcade_torch.agents.runs.checkpoint import load_latest, save_checkpoint
-from arcade_torch.agents.runs.files import CsvLog, list_checkpoints, read_csv, write_json
+from arcade_torch.agents.runs.files import CsvLog, list_checkpoints, read_log, write_json
 from arcade_torch.agents.runs.folder import EVAL_COLUMNS, METRIC_COLUMNS, RunFolder, RunFolderError
 from arcade_torch.agents.runs.loggers import RunLogger, check_logger
 from arcade_torch.agents.torch_settings import Settings, given_back, plain_torch
@@ -248,19 +248,18 @@ class _Run:
     def _finish(self) -> TrainResult:
         began = time.perf_counter()
         result = self._evaluate()
-        rows = [
-            row
-            for row in read_csv(self.folder.path / "metrics.csv", strict=False)
-            if row["train_return_last"]
-        ]
-        frames = [float(row["frames"]) for row in rows]
-        returns = [float(row["train_return_last"]) for row in rows]
+        frames = []
+        returns = []
+        for row in read_log(self.folder.path / "metrics.csv"):
+            if row["train_return_last"]:
+                frames.append(float(row["frames"]))
+                returns.append(float(row["train_return_last"]))
         is_finite = all(map(math.isfinite, returns))
         if not is_finite:
             warnings.warn(
                 "train_max_ewm is missing: a return of the training is not finite", stacklevel=3
             )
-        score = paper_score(frames, returns) if rows and is_finite else None
+        score = paper_score(frames, returns) if returns and is_finite else None
         final = {
             "status": "finished",
             "frames": self.trainer.frames,

@@ -444,7 +444,7 @@ class ArcadeCollector(BaseCollector):
         if self._obs is None or self._buffer is None:
             return out
         out["recurrent_state"] = self._state.clone().to_dict()
-        out["left"] = self._runner.left_state()
+        out["left"] = self._runner.root_outputs()
         out["window_starts"] = [state.clone().to_dict() for state in self._window_starts]
         out["overlap"] = self._buffer.overlap_state()
         return out
@@ -523,7 +523,7 @@ class ArcadeCollector(BaseCollector):
         # last, for an overlap that was refused is none to go on with
         self._acted = acted
         self._state = state
-        self._runner.load_left_state(state_dict.get("left", {}))
+        self._runner.load_root_outputs(state_dict.get("left", {}))
         self._window_starts.extend(starts)
 
     def _as_state(self, state: dict[str, Any], initial: TensorDict) -> TensorDict:

@@ -145,11 +145,9 @@ def warn_frames_are_copied() -> None:
     """Say once that torch is on CUDA and JAX is not, and which package is missing."""
     major = (torch.version.cuda or "12").split(".")[0]
     package = f"jax-cuda{major}-plugin"
-    have = (
-        "is installed but found no GPU"
-        if importlib.util.find_spec(package.replace("-", "_"))
-        else "is missing"
-    )
+    have = "is missing"
+    if importlib.util.find_spec(package.replace("-", "_")):
+        have = "is installed but found no GPU"
     warn(
         f"torch is on CUDA but JAX computes on the CPU ({package} {have}): every frame is copied "
         f"to the GPU. Install it with: pip install 'jax[cuda{major}]'"

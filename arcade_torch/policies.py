@@ -64,13 +64,13 @@ class PolicyRunner:
         # what the env writes under "next", whatever a policy has written there
         self._outcomes = {path_of(key) for key in (*root_keys, "reward", *ENDS)}
         # states of modules that begin anew by themselves
-        self._begin_themselves: set[NestedKey] = set()
+        self._self_resetting: set[NestedKey] = set()
         self._initial = TensorDict({}, batch_size=self._size, device=device)
         # whether the primers give other values for every episode
-        self._varies = False
+        self._start_is_drawn = False
         # what the policy wrote to the root at the last step
-        self._left: dict[NestedKey, torch.Tensor] = {}
-        self._shows_left = not _takes_one_layout(policy)
+        self._root_outputs: dict[NestedKey, torch.Tensor] = {}
+        self._shows_root_outputs = not _takes_one_layout(policy)
 
     def initial_state(self) -> TensorDict:
         """Values of the policy's primers, TensorDict [N]; what the policy wrote is forgotten.
@@ -78,10 +78,10 @@ class PolicyRunner:
         Raises:
             KeyError: The policy carries an entry from step to step for which it has no primer.
         """
-        self._left = {}
-        self._varies = any(map(_varies, _primers(self._policy)))
+        self._root_outputs = {}
+        self._start_is_drawn = any(map(_is_drawn, _primers(self._policy)))
         if not self._store_states:  # stored ones show what a module begins with
-            self._begin_themselves = _begin_themselves(self._policy)
+            self._self_resetting = _self_resetting(self._policy)
         state = self._first_values()
         written = [unravel_key(key) for key in getattr(self._policy, "out_keys", [])]
         for key in getattr(self._policy, "in_keys", []):
@@ -128,17 +128,17 @@ class PolicyRunner:
         """
         if self._policy is None:
             return None, {}, state
-        if set(state.keys(True, True)) - self._begin_themselves:
-            state = self.begin_anew(state, obs["is_init"], self._begin_themselves)
+        if set(state.keys(True, True)) - self._self_resetting:
+            state = self.begin_anew(state, obs["is_init"], self._self_resetting)
         # the same at every step: graphs hold one layout
         entries = {key: obs[key] for key in self.reads if key in obs} | self._ends
-        entries = self._left | entries | dict(state.items())
+        entries = self._root_outputs | entries | dict(state.items())
         td = TensorDict(entries, batch_size=self._size, device=self._device)
         td = self._policy(td)
         if not isinstance(td, TensorDictBase) or "action" not in td:
             _refuse_output(td)
         stored, carried = self._take_apart(td, state)
-        if self._varies and obs["is_init"].any():
+        if self._start_is_drawn and obs["is_init"].any():
             self._initial = self._first_values()
         return td["action"], stored, carried
 
@@ -149,7 +149,7 @@ class PolicyRunner:
         it wrote to the root is kept for its next step.
         """
         stored: dict[NestedKey, torch.Tensor] = {}
-        left: dict[NestedKey, torch.Tensor] = {}
+        root_outputs: dict[NestedKey, torch.Tensor] = {}
         carried = TensorDict({}, batch_size=self._size, device=self._device)
         for key, value in state.items(True, True):
             carried[key] = td.get(key, value)  # unless the policy writes another for the next step
@@ -161,27 +161,28 @@ class PolicyRunner:
             if path[0] == "next":
                 carried[path[1:]] = value
             is_state = path[0] == "next" or path in states
-            if not is_state and (path[0] not in self._known or path == ("action",)):
-                left[key] = value
-            if path[0] not in self._known and self._keeps(path, is_state):
+            is_own = path[0] not in self._known
+            if not is_state and (is_own or path == ("action",)):
+                root_outputs[key] = value
+            if is_own and self._keeps(path, is_state):
                 stored[key] = value
-        self._left = left if self._shows_left else {}
+        self._root_outputs = root_outputs if self._shows_root_outputs else {}
         return stored, carried
 
     def show_action(self, action: torch.Tensor) -> None:
         """Put the action that was taken in the place of the policy's."""
-        if "action" in self._left:
-            self._left["action"] = action
+        if "action" in self._root_outputs:
+            self._root_outputs["action"] = action
 
-    def left_state(self) -> dict[str, Any]:
+    def root_outputs(self) -> dict[str, Any]:
         """What the policy wrote to the root at the last step, as plain tensors."""
-        left: dict[str, Any] = TensorDict(self._left, batch_size=self._size).clone().to_dict()
-        return left
+        outputs = TensorDict(self._root_outputs, batch_size=self._size)
+        return outputs.clone().to_dict()  # type: ignore[no-any-return]
 
-    def load_left_state(self, state: dict[str, Any]) -> None:
-        """Load what ``left_state`` gave."""
-        left = TensorDict(state, batch_size=self._size, device=self._device)
-        self._left = dict(left.items(True, True))
+    def load_root_outputs(self, state: dict[str, Any]) -> None:
+        """Load what ``root_outputs`` gave."""
+        outputs = TensorDict(state, batch_size=self._size, device=self._device)
+        self._root_outputs = dict(outputs.items(True, True))
 
     def _keeps(self, path: tuple[str, ...], is_state: bool) -> bool:
         """Whether an entry is stored: private ones if they are asked for, as in TorchRL's
@@ -298,7 +299,7 @@ def _primers(policy: Any) -> list[TensorDictPrimer]:
     return [primers] if isinstance(primers, TensorDictPrimer) else list(primers)
 
 
-def _begin_themselves(policy: Any) -> set[NestedKey]:
+def _self_resetting(policy: Any) -> set[NestedKey]:
     """The states of the modules that read ``is_init``, where they begin anew."""
     keys = set[NestedKey]()
     for module in _module_of(policy).modules():
@@ -328,7 +329,7 @@ def check_state_keys(policy: Any) -> None:
                 )
 
 
-def _varies(primer: TensorDictPrimer) -> bool:
+def _is_drawn(primer: TensorDictPrimer) -> bool:
     """Whether a primer gives other values for every episode."""
     given = primer.default_value
     if primer.random or callable(given):

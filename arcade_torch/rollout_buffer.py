@@ -97,9 +97,9 @@ class RolloutBuffer:
         observation: Mapping[NestedKey, Entry],
         action: Entry,
         device: torch.device,
-        final_frames: FinalFrames = "all",
-        max_steps: int = 1,
-        task: torch.Tensor | None = None,
+        final_frames: FinalFrames,
+        max_steps: int,
+        task: torch.Tensor | None,
     ) -> None:
         self.num_envs = num_envs
         self.overlap = overlap

@@ -24,11 +24,9 @@ def make_specs(
     )
     if one_hot:
         action = OneHot(num_actions, shape=(num_envs, num_actions), dtype=torch.bool, device=device)
-    task = (
-        {"task": Categorical(num_tasks, shape=(num_envs,), dtype=torch.int64, device=device)}
-        if num_tasks
-        else {}
-    )
+    task = {}
+    if num_tasks:
+        task["task"] = Categorical(num_tasks, shape=(num_envs,), dtype=torch.int64, device=device)
     observation = Composite(
         **task,
         pixels=Unbounded((num_envs, obs_size, obs_size, 3), dtype=torch.uint8, device=device),

@@ -57,8 +57,9 @@ if not TYPE_CHECKING:  # a checker is to find misspelt names
 
     def __getattr__(name: str) -> Any:
         """Import a public name when it is first asked for (PEP 562)."""
-        for module in ("batch", "checks", "game", "mixture") if name in __all__ else ():
-            public = vars(import_module(f"arcade_torch.envs_jax.{module}"))
-            if name in public:
-                return public[name]
+        if name in __all__:
+            for module in ("batch", "checks", "game", "mixture"):
+                public = vars(import_module(f"arcade_torch.envs_jax.{module}"))
+                if name in public:
+                    return public[name]
         raise AttributeError(f"module 'arcade_torch.envs_jax' has no attribute {name!r}")

@@ -99,8 +99,9 @@ def _add(id: str, factory: Factory | str, aliases: Iterable[str], probe: bool) -
             )
     _ENTRIES[id] = _Entry(factory, probe)
     _ALIASES.update(names)
-    for listener in () if probe else _LISTENERS:
-        listener(id)
+    if not probe:
+        for listener in _LISTENERS:
+            listener(id)
 
 
 def on_register(listener: Callable[[str], object]) -> None:
@@ -248,10 +249,11 @@ def is_built_in(id: str) -> bool:
 
 def _newest() -> dict[str, str]:
     """The newest id of each bare name."""
-    versions = sorted(
-        (int(version), name) for name, version in (id.rsplit("-v", 1) for id in _ENTRIES)
-    )
-    return {name: f"{name}-v{version}" for version, name in versions}
+    newest = dict[str, int]()
+    for id in _ENTRIES:
+        name, _, version = id.rpartition("-v")
+        newest[name] = max(newest.get(name, 0), int(version))
+    return {name: f"{name}-v{version}" for name, version in newest.items()}
 
 
 def make(id: str, *, obs_size: int = 128, rules: str = "default", **options: Any) -> "Game[Any]":

@@ -87,11 +87,10 @@ def gru_loop(
     size = candidate_weight.shape[0]
     steps = F.linear(x, input_weight, input_bias)
     begins = start.unsqueeze(-1).unbind(1)
-    fresh = (
-        stored.expand_as(steps[..., :size])
-        if stored.shape[1] > 1
-        else F.pad(stored, (0, 0, 0, steps.shape[1] - 1))
-    )
+    if stored.shape[1] > 1:
+        fresh = stored.expand_as(steps[..., :size])
+    else:
+        fresh = F.pad(stored, (0, 0, 0, steps.shape[1] - 1))
     states = []
     gates = []
     h = stored[:, 0]

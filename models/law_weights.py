@@ -71,7 +71,8 @@ def _weights_in(value: Any) -> list[Tensor]:
         return [value] if value.requires_grad and value.is_leaf else []
     weights = list[Tensor]()
     for held in held_by(value):
-        for thing in _named_by(held) if isinstance(held, FunctionType) else [held]:
+        things = _named_by(held) if isinstance(held, FunctionType) else [held]
+        for thing in things:
             if isinstance(thing, nn.Module) and thing is not value:
                 weights += thing.parameters()
             elif isinstance(thing, nn.Parameter):

@@ -53,11 +53,9 @@ class LinearTransformer(FastWeights):
         if not legacy_normaliser:
             self.state_shape = (self.key_size, self.key_size + 1)
         self.output = nn.Linear(self.key_size, hidden_size)
-        self.skip = (
-            nn.Identity()
-            if input_size == hidden_size
-            else nn.Linear(input_size, hidden_size, bias=False)
-        )
+        self.skip: nn.Module = nn.Identity()
+        if input_size != hidden_size:
+            self.skip = nn.Linear(input_size, hidden_size, bias=False)
 
     def steps(self, x: Tensor, counters: dict[str, Tensor]) -> MatrixSteps:
         """See :meth:`FastWeights.steps`."""

@@ -85,10 +85,11 @@ class LRU(Memory):
         self.output = nn.Parameter(
             torch.randn(hidden_size, hidden_size, 2) / math.sqrt(hidden_size)
         )
-        skip = (hidden_size,) if input_size == hidden_size else (hidden_size, input_size)
-        self.skip = nn.Parameter(
-            torch.randn(skip) / (1 if len(skip) == 1 else math.sqrt(input_size))
-        )
+        if input_size == hidden_size:
+            skip = torch.randn(hidden_size)
+        else:
+            skip = torch.randn(hidden_size, input_size) / math.sqrt(input_size)
+        self.skip = nn.Parameter(skip)
 
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`; the state is [..., H, 2]."""

@@ -22,9 +22,9 @@ from arcade_torch.models.sequential import (
 
 __all__ = ["LSTM", "lstm_loop", "lstm_scan", "lstm_scan_backward"]
 
+# with less for each, calls of torch's LSTM are no faster
 STEPS_PER_CALL = 8
-ROWS_PER_CALL = 64
-"""Steps, and steps times batch: with less for each, calls of torch's LSTM are no faster."""
+ROWS_PER_CALL = 64  # steps times batch
 OPTIONS = (True, 1, 0.0, True, False, True)
 """Of torch's LSTM: biases, one layer, no dropout, fit for a backward pass, one direction, batch
 first."""

@@ -218,12 +218,12 @@ class SequenceChecks:
     To look is to wait for the device. So on a GPU it looks at the first batch of each shape, on a
     CPU at all, and nowhere inside of ``torch.compile``, ``vmap`` or a CUDA graph.
 
-    Args:
+    Attributes:
         enabled: whether it looks at all.
     """
 
-    def __init__(self, enabled: bool = True) -> None:
-        self.enabled = enabled
+    def __init__(self) -> None:
+        self.enabled = True
         self._shapes: set[tuple[int, ...]] = set()
         self._steps_without_state = 0
         self._has_warned = False

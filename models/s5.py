@@ -68,12 +68,11 @@ class S5(Memory):
         # real and imaginary part; both matrices have entries of variance one over their inputs
         self.input = nn.Parameter(torch.randn(2, pairs, input_size) / math.sqrt(2 * input_size))
         self.output = nn.Parameter(torch.randn(hidden_size, 2, pairs) / math.sqrt(2 * size))
-        square = input_size == hidden_size
-        self.skip = nn.Parameter(
-            torch.randn(hidden_size)
-            if square
-            else torch.randn(hidden_size, input_size) / math.sqrt(input_size)
-        )
+        if input_size == hidden_size:
+            skip = torch.randn(hidden_size)
+        else:
+            skip = torch.randn(hidden_size, input_size) / math.sqrt(input_size)
+        self.skip = nn.Parameter(skip)
 
     def run(self, x: Tensor, h0: Tensor, is_init: Tensor) -> tuple[Tensor, Tensor]:
         """See :meth:`Memory.run`; the state is [..., 2, N]."""

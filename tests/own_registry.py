@@ -8,7 +8,7 @@ import pytest
 from gymnasium.envs import registration
 
 from arcade_torch.envs_jax import registry
-from arcade_torch.tools.options import VARIABLE
+from arcade_torch.tools.imports import VARIABLE
 
 
 def forget_games(monkeypatch: pytest.MonkeyPatch) -> None:

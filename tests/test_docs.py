@@ -11,7 +11,7 @@ import pytest
 
 from arcade_torch.models import registry
 from arcade_torch.tools import cli
-from arcade_torch.tools.options import take_imports
+from arcade_torch.tools.imports import take_imports
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = sorted(

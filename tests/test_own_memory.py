@@ -13,7 +13,7 @@ from arcade_torch.models.memory import replay
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench.memory_tests.table import Row
 from arcade_torch.tools.files import read_rows
-from arcade_torch.tools.options import VARIABLE
+from arcade_torch.tools.imports import VARIABLE
 
 FILE = Path(__file__).resolve().parents[1] / "examples/own_memory.py"
 

@@ -90,11 +90,12 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "bench compare": ("bench.BenchCompare", "what became better or worse between two such files"),
 }
 """Name -> module and class in `arcade_torch.tools.commands`, and what it does in a few words."""
-GROUPS = {
-    group: [name.split()[1] for name in COMMANDS if name.startswith(f"{group} ")]
-    for group in dict.fromkeys(name.split()[0] for name in COMMANDS if " " in name)
-}
+GROUPS: dict[str, list[str]] = {}
 """First word of commands of two words -> the second ones."""
+for _name in COMMANDS:
+    _group, _, _second = _name.partition(" ")
+    if _second:
+        GROUPS.setdefault(_group, []).append(_second)
 
 
 def usage() -> str:
@@ -312,11 +313,10 @@ def _tell(error: BaseException) -> int:
         for at, _ in traceback.walk_tb(error.__traceback__)
     }
     modules_of_user = [name for name in imported() if any(name in names for names in passed)]
-    _say(
-        f"{modules_of_user[0]} failed:"
-        if modules_of_user
-        else "this is a fault of arcade-torch; please report it with what follows"
-    )
+    if modules_of_user:
+        _say(f"{modules_of_user[0]} failed:")
+    else:
+        _say("this is a fault of arcade-torch; please report it with what follows")
     lines = "".join(traceback.format_exception(error)).rstrip("\n").split("\n")
     for line in lines:
         warn(line)

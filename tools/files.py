@@ -20,8 +20,7 @@ from typing import IO, Any, NamedTuple, TypeVar
 
 import numpy as np
 
-from arcade_torch.agents.runs.files import open_regular, read_text, write_atomic
-from arcade_torch.agents.runs.files import read_csv as read_csv
+from arcade_torch.agents.runs.files import open_regular, read_csv, read_text, write_atomic
 from arcade_torch.agents.runs.shipped import is_shipped
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.text import csv_cell, markdown_cell, printable
@@ -224,12 +223,10 @@ def read_npz(path: Path) -> dict[str, Any]:
 def _check_header(member: IO[bytes], size: int) -> None:
     """Refuse an array that claims to be larger than what is stored of it, or that holds objects."""
     version = np.lib.format.read_magic(member)
-    read = (
-        np.lib.format.read_array_header_1_0
-        if version == (1, 0)
-        else np.lib.format.read_array_header_2_0
-    )
-    shape, _, dtype = read(member)
+    if version == (1, 0):
+        shape, _, dtype = np.lib.format.read_array_header_1_0(member)
+    else:
+        shape, _, dtype = np.lib.format.read_array_header_2_0(member)
     if dtype.hasobject or math.prod(shape) * dtype.itemsize > size:
         raise ValueError(
             f"an array claims to be {dtype} {list(shape)}, which is not what is stored"

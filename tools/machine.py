@@ -116,11 +116,11 @@ def torch_threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def bfloat16_time(config: "TrainConfig", frames: int = 64, turns: int = 3) -> float:
+def bfloat16_time(config: "TrainConfig", frames: int = 64) -> float:
     """How long the network's encoder takes for some frames, forwards and backwards, in bfloat16,
     where float32 takes 1.
 
-    Measured in turn, the least of each counts. Of two processors with AVX-512 and bfloat16 and
+    Measured in turn, the least of three counts. Of two processors with AVX-512 and bfloat16 and
     without AMX a Xeon takes 1.15 to 1.3, an EPYC .35 to .6.
     """
     import torch
@@ -132,7 +132,7 @@ def bfloat16_time(config: "TrainConfig", frames: int = 64, turns: int = 3) -> fl
     encoder = next(module for module in network.modules() if isinstance(module, Encoder))
     pixels = torch.zeros(frames, *encoder.stored_shape, dtype=torch.uint8, device=config.device)
     least = {True: math.inf, False: math.inf}
-    for amp in [True, False] * turns:
+    for amp in [True, False] * 3:
         encoder.amp = amp
         begin = time.perf_counter()
         encoder(pixels).square().sum().backward()
@@ -157,7 +157,7 @@ def keep_freed_memory() -> bool:
     return all(mallopt(name, value) == 1 for name, value in _MALLOC.items())
 
 
-def watch_parent(every_s: float = 2.0) -> None:
+def watch_parent() -> None:
     """In a worker: stop with a checkpoint when the study that started it is gone; elsewhere nothing
     happens.
     """
@@ -165,7 +165,7 @@ def watch_parent(every_s: float = 2.0) -> None:
 
     def look() -> None:
         while str(os.getppid()) == parent:
-            time.sleep(every_s)
+            time.sleep(2.0)
         os.kill(os.getpid(), signal.SIGTERM)
 
     watches = any(thread.name == _WATCH for thread in threading.enumerate())

@@ -11,9 +11,6 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from arcade_torch.tools.imports import FLAG, imported
-from arcade_torch.tools.imports import VARIABLE as VARIABLE
-from arcade_torch.tools.imports import load_extensions as load_extensions
-from arcade_torch.tools.imports import take_imports as take_imports
 
 LARGEST = 2**53
 """No option that counts something goes beyond; up to here every whole number is a float as well."""

@@ -9,12 +9,11 @@ from typing import Any
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.differences import differing_fields, flatten
 from arcade_torch.agents.runs.files import (
-    is_final,
     list_checkpoints,
-    read_csv,
     read_json,
-    wrong_mean,
+    read_log,
 )
+from arcade_torch.agents.runs.final import is_final, wrong_mean
 from arcade_torch.tools.imports import remembered_imports
 from arcade_torch.tools.names import AgentKey
 
@@ -101,7 +100,7 @@ class Run:
         file = self.path / name
         if not file.exists():
             return []
-        return read_csv(file, strict=False)
+        return read_log(file)
 
     @cached_property
     def key(self) -> AgentKey:

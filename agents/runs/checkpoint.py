@@ -146,7 +146,9 @@ def _write_parts(
 
 def remove_draft_checkpoints(folder: Path) -> None:
     """Remove what a killed process left of a checkpoint, and nothing else."""
-    for path in folder.iterdir() if folder.is_dir() else ():
+    if not folder.is_dir():
+        return
+    for path in folder.iterdir():
         if is_ours(path, "checkpoint draft"):
             shutil.rmtree(path, ignore_errors=True)
 

@@ -8,7 +8,6 @@ import errno
 import hashlib
 import io
 import json
-import math
 import os
 import re
 import secrets
@@ -29,12 +28,6 @@ MOST_TENSORS = 16 * 2**30
 """Bytes of the largest file of tensors that is read."""
 LATEST = "latest"
 """File in ``checkpoints/`` with the name of the newest."""
-MEAN_TOLERANCE = 1e-5
-"""A mean in float32 may differ from that of its returns in float64 by this share of the largest."""
-MOST_COUNT = 1e15
-"""The largest number of frames, steps or seconds of a run."""
-MOST_RETURN = 3.5e38
-"""Above the largest finite return, which has single precision."""
 _END_BYTES = 2**16
 _OUR_NAMES = {
     "draft": re.compile(r"\..{1,40}\.\d+-[0-9a-f]{8}\.draft", re.DOTALL),
@@ -80,7 +73,7 @@ def is_inside(folder: Path, name: str) -> bool:
     return not any(place.is_symlink() for place in places)
 
 
-def open_regular(path: Path, most_bytes: int | None = MOST_TEXT) -> BinaryIO:
+def open_regular(path: Path, most_bytes: int | None) -> BinaryIO:
     """Open a file for reading, if it is a regular one of a size that can be meant.
 
     What is opened is looked at, so that nothing can take its place in between; nothing is waited
@@ -240,7 +233,9 @@ def _make_folder(path: Path) -> None:
 
 def remove_drafts(folder: Path) -> None:
     """Remove what :func:`write_atomic` of a killed process left in a folder, and nothing else."""
-    for path in folder.iterdir() if folder.is_dir() else ():
+    if not folder.is_dir():
+        return
+    for path in folder.iterdir():
         if is_ours(path, "draft"):
             path.unlink(missing_ok=True)
 
@@ -288,67 +283,6 @@ def latest_name(folder: Path) -> str:
     return name if is_our_name(name, "checkpoint") else ""
 
 
-def is_final(values: Any, needed: Sequence[str] = ()) -> bool:
-    """Whether ``values``, with all ``needed`` keys, is what the ``eval.json`` of a finished run
-    holds.
-    """
-    if not isinstance(values, dict) or not set(needed) <= set(values):
-        return False
-    if values.get("status", "finished") != "finished":
-        return False
-    returns = values.get("returns", [])
-    lengths = values.get("lengths", [])
-    if not isinstance(returns, list) or not isinstance(lengths, list):
-        return False
-    has_mean = values["mean"] is not None if "mean" in values else bool(returns)
-    if not has_mean:
-        return False
-
-    counts = [*lengths, *_present(values, "n", "frames", "seconds")]
-    scores = [*returns, *_present(values, "mean", "std", "ci", "train_max_ewm")]
-    if not all(_is_real(n, MOST_COUNT) for n in counts):
-        return False
-    # an evaluation whose returns are infinite is one, and would be so again
-    if not all(_is_real(n, MOST_RETURN) or n in (math.inf, -math.inf) for n in scores):
-        return False
-
-    are_whole = all(type(length) is int for length in lengths)
-    are_pairs = 0 < len(returns) == len(lengths) or not {"returns", "lengths"} <= set(values)
-    is_negative = any((values.get(name) or 0) < 0 for name in ("frames", "seconds"))
-    return are_whole and are_pairs and not is_negative and not wrong_mean(values)
-
-
-def _present(values: Mapping[str, Any], *names: str) -> list[Any]:
-    """What stands under some names, without what is missing or None."""
-    return [values[name] for name in names if values.get(name) is not None]
-
-
-def _is_real(value: Any, most: float) -> bool:
-    """Whether a value is a number up to a size, so that it can be squared; NaN is one."""
-    return type(value) in (int, float) and not abs(value) > most
-
-
-def wrong_mean(values: Any) -> str:
-    """In what the mean of an ``eval.json`` is not that of its returns; empty if it is, or what
-    stands there are no numbers.
-    """
-    if not isinstance(values, dict) or "mean" not in values or not values.get("returns"):
-        return ""
-    try:
-        mean = float(values["mean"])
-        returns = list(map(float, values["returns"]))
-        actual = math.fsum(returns) / len(returns)
-        size = max(1.0, *map(abs, returns))
-    except (TypeError, ValueError, OverflowError):
-        return ""
-    is_equal = mean == actual  # of infinities
-    if math.isfinite(size):
-        is_equal = abs(mean - actual) <= MEAN_TOLERANCE * size  # no number is equal to NaN
-    if is_equal or (math.isnan(mean) and math.isnan(actual)):
-        return ""
-    return f"its mean is {mean:g}, but that of its {len(returns)} returns is {actual:g}"
-
-
 class CsvLog:
     """A table, first column ``frames``, that grows by whole rows; on opening, what is beyond
     ``keep_frames`` is dropped.
@@ -357,7 +291,7 @@ class CsvLog:
     def __init__(self, path: Path, columns: Sequence[str], keep_frames: int = 0) -> None:
         self.path = path
         self.columns = list(columns)
-        rows = read_csv(path, strict=False) if path.exists() else []
+        rows = read_log(path) if path.exists() else []
         kept = [
             [row.get(name, "") for name in columns]
             for row in rows
@@ -382,45 +316,62 @@ class CsvLog:
             self._stream.close()
 
 
-def read_csv(path: Path, strict: bool = True) -> list[dict[str, str]]:
+def read_csv(path: Path) -> list[dict[str, str]]:
     """Rows of a table with a header.
-
-    Args:
-        path: the file.
-        strict: refuse a line of another length; else the file is a log, its first column is
-            ``frames``, and unfinished or damaged lines are left out.
 
     Raises:
         FileNotFoundError: there is none.
-        ValueError: it is no text, has no header or a name twice in it, or has such a line.
+        ValueError: it is no text, has no header or a name twice in it, or has a line of another
+            length.
+    """
+    lines = _read_cells(path, "not CSV in UTF-8")
+    if not lines:
+        raise ValueError(f"{path} is empty: expected CSV with a header line")
+    header, *rows = lines
+    on_one_line = all(name.splitlines() in ([name], []) for name in header)
+    if len(set(header)) != len(header) or not on_one_line:
+        raise ValueError(f"{path} has a header that names a column twice, or over several lines")
+    for row in rows:
+        if len(row) != len(header):
+            which = "more" if len(row) > len(header) else "fewer"
+            raise ValueError(
+                f"{path} has a line with {which} cells than its header names{_divided(header)}"
+            )
+    return [dict(zip(header, row, strict=True)) for row in rows]
+
+
+def read_log(path: Path) -> list[dict[str, str]]:
+    """Rows of a table that a `CsvLog` adds to; lines that are unfinished or damaged are left out.
+
+    Raises:
+        FileNotFoundError: there is none.
+        ValueError: it is no text, or its first column is not ``frames``.
+    """
+    lines = _read_cells(path, "damaged, it is no table", unfinished=False)
+    if not lines:
+        return []
+    header, *rows = lines
+    if header[0] != "frames" or header.count("frames") != 1:
+        raise ValueError(f"{path} is damaged: its first line does not begin with 'frames'")
+    whole = []
+    for row in rows:
+        if len(row) == len(header) and re.fullmatch("[0-9]{1,15}", row[0]):
+            whole.append(dict(zip(header, row, strict=True)))
+    return whole
+
+
+def _read_cells(path: Path, wrong: str, unfinished: bool = True) -> list[list[str]]:
+    """The cells of all lines that are not empty; with a last one that is ``unfinished``, or
+    without.
     """
     try:
         text = read_text(path)
         _check_size(path, text)
-        text = text if strict else text[: text.rfind("\n") + 1]
-        header, *rows = [row for row in csv.reader(io.StringIO(text, newline="")) if row] or [[]]
+        if not unfinished:
+            text = text[: text.rfind("\n") + 1]
+        return [row for row in csv.reader(io.StringIO(text, newline="")) if row]
     except (UnicodeDecodeError, csv.Error) as error:
-        raise ValueError(
-            f"{path} is {'not CSV in UTF-8' if strict else 'damaged, it is no table'}: {error}"
-        ) from error
-    if not strict:
-        if header and (header.count("frames") != 1 or header[0] != "frames"):
-            raise ValueError(f"{path} is damaged: its first line does not begin with 'frames'")
-        rows = [
-            row for row in rows if len(row) == len(header) and re.fullmatch("[0-9]{1,15}", row[0])
-        ]
-    elif not header:
-        raise ValueError(f"{path} is empty: expected CSV with a header line")
-    elif len(set(header)) != len(header) or any(
-        name.splitlines() not in ([name], []) for name in header
-    ):
-        raise ValueError(f"{path} has a header that names a column twice, or over several lines")
-    elif wrong := next((row for row in rows if len(row) != len(header)), None):
-        which = "more" if len(wrong) > len(header) else "fewer"
-        raise ValueError(
-            f"{path} has a line with {which} cells than its header names{_divided(header)}"
-        )
-    return [dict(zip(header, row, strict=True)) for row in rows]
+        raise ValueError(f"{path} is {wrong}: {error}") from error
 
 
 def _divided(header: Sequence[str]) -> str:

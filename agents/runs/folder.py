@@ -18,11 +18,11 @@ from arcade_torch.agents.differences import differing_fields
 from arcade_torch.agents.runs.checkpoint import FORMAT, refuse_format, remove_draft_checkpoints
 from arcade_torch.agents.runs.files import (
     check_writable_folder,
-    is_final,
     read_json,
     remove_drafts,
     write_json,
 )
+from arcade_torch.agents.runs.final import is_final
 
 METRIC_COLUMNS = (
     "frames", "updates", "grad_steps", "seconds", "fps",
@@ -77,9 +77,9 @@ class RunFolder:
         if self._config.exists() and resume:
             self._check_same(config)
         elif self.path.is_dir() and any(entry.name != LOCK for entry in self.path.iterdir()):
-            hint = (
-                "pass resume=True (--resume) to continue it, or " if self._config.is_file() else ""
-            )
+            hint = ""
+            if self._config.is_file():
+                hint = "pass resume=True (--resume) to continue it, or "
             raise RunFolderError(f"{self.path} is not empty; {hint}choose another folder")
         try:
             check_writable_folder(self.path.absolute(), self.path)

@@ -49,18 +49,15 @@ class RunLogger:
         """Log a row of ``metrics.csv`` or ``eval.csv``, without empty cells, as ``group/name``, of
         times ``time/name``.
         """
-        if (logger := self._logger) is not None:
-            names = {
-                key: "time" if key in ("seconds", "fps") else group
-                for key in row
-                if key != "frames"
-            }
-            values = {
-                f"{name}/{key}": float(row[key])
-                for key, name in names.items()
-                if row[key] is not None
-            }
-            self._try(lambda: logger.log_metrics(values, step=int(row["frames"])))
+        logger = self._logger
+        if logger is None:
+            return
+        values = {}
+        for name, value in row.items():
+            if name != "frames" and value is not None:
+                place = "time" if name in ("seconds", "fps") else group
+                values[f"{place}/{name}"] = float(value)
+        self._try(lambda: logger.log_metrics(values, step=int(row["frames"])))
 
     def close(self) -> None:
         """Write what is left and let go."""
@@ -75,11 +72,10 @@ class RunLogger:
             return call()
         except Exception as error:
             self._logger = None
-            said = (
-                f"logging ends here, the run and its CSV files go on: {type(error).__name__}: "
-                f"{error}"
+            reason = f"{type(error).__name__}: {error}"
+            warnings.warn(
+                f"logging ends here, the run and its CSV files go on: {reason}", stacklevel=3
             )
-            warnings.warn(said, stacklevel=3)
 
 
 def _tensorboard(config: TrainConfig, folder: Path, frames: int) -> Any:

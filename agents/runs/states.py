@@ -34,16 +34,13 @@ def check_state(saved: Any, expected: Any, name: str = "the state") -> None:
             check_state(saved[key], expected[key], f"{name}[{key!r}]")
     elif isinstance(expected, list | tuple):
         _require(isinstance(saved, list | tuple), name, saved, "a list")
-        _require(
-            not expected or len(saved) == len(expected), name, saved, f"a list of {len(expected)}"
-        )
+        fits = not expected or len(saved) == len(expected)
+        _require(fits, name, saved, f"a list of {len(expected)}")
         for index, (one, other) in enumerate(zip(saved, expected, strict=False)):
             check_state(one, other, f"{name}[{index}]")
     elif isinstance(expected, Tensor):
-        same = isinstance(saved, Tensor) and (saved.dtype, saved.shape) == (
-            expected.dtype,
-            expected.shape,
-        )
+        _require(isinstance(saved, Tensor), name, saved, _described(expected))
+        same = (saved.dtype, saved.shape) == (expected.dtype, expected.shape)
         _require(same, name, saved, _described(expected))
     else:
         _check_value(saved, expected, name)
@@ -66,19 +63,11 @@ def check_optimizer(saved: Any, parameters: Sequence[nn.Parameter]) -> None:
     a ``ValueError``.
     """
     name = "the state['optimizer']"
-    _require(
-        isinstance(saved, Mapping) and isinstance(saved.get("state"), Mapping),
-        name,
-        saved,
-        "one of an optimiser",
-    )
+    is_state = isinstance(saved, Mapping) and isinstance(saved.get("state"), Mapping)
+    _require(is_state, name, saved, "one of an optimiser")
     for index, averages in saved["state"].items():
-        _require(
-            type(index) is int and 0 <= index < len(parameters),
-            name,
-            index,
-            "numbers of parameters",
-        )
+        is_place = type(index) is int and 0 <= index < len(parameters)
+        _require(is_place, name, index, "numbers of parameters")
         part = f"{name}[{index}]"
         complete = isinstance(averages, Mapping) and set(averages) == _MOMENTS
         _require(complete, part, averages, f"a table of {', '.join(sorted(_MOMENTS))}")
@@ -102,13 +91,9 @@ def _described(value: Any) -> str:
         return f"{kind_of(value)} of {len(value)}"
     if isinstance(value, str):
         return repr(value[:40])
-    if (
-        value is None
-        or isinstance(value, bool | float)
-        or (isinstance(value, int) and abs(value) < LARGEST)
-    ):
-        return repr(value)
-    return kind_of(value)
+    if isinstance(value, int) and abs(value) >= LARGEST:
+        return kind_of(value)
+    return repr(value) if isinstance(value, int | float | None) else kind_of(value)
 
 
 def _require(fits: bool, name: str, saved: Any, allowed: str) -> None:

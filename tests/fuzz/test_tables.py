@@ -14,8 +14,9 @@ from arcade_torch.tools.bench.recall import Recall
 from arcade_torch.tools.figures import logs
 from arcade_torch.tools.figures.logs import mean_series, series
 from arcade_torch.tools.files import read_rows, write_between, write_csv
+from arcade_torch.tools.imports import take_imports
 from arcade_torch.tools.measures.gap_bias.measure import gap_and_bias
-from arcade_torch.tools.options import name_and_value, take_imports
+from arcade_torch.tools.options import name_and_value
 from arcade_torch.tools.play.scores import (
     COLUMNS,
     append_score,

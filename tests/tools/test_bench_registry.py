@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
+from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli
 from arcade_torch.tools.bench.registry import SIZES, TABLES, compare, page, read_results
-from arcade_torch.tools.files import read_csv
 from tests.tools.test_cli import one_error
 
 RESULTS: dict[str, Any] = {

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from arcade_torch.agents.evaluation import EvalResult
-from arcade_torch.agents.runs.files import is_final, wrong_mean
+from arcade_torch.agents.runs.final import is_final, wrong_mean
 from arcade_torch.agents.runs.folder import RunFolder
 from arcade_torch.tools import cli
 from arcade_torch.tools.comparable import find_runs

@@ -11,8 +11,8 @@ import pytest
 
 from arcade_torch.envs_jax import registered_ids
 from arcade_torch.tools import cli
-from arcade_torch.tools.imports import imported
-from arcade_torch.tools.options import VARIABLE, command_line, load_extensions, take_imports
+from arcade_torch.tools.imports import VARIABLE, imported, load_extensions, take_imports
+from arcade_torch.tools.options import command_line
 from tests.own_registry import own_registry  # noqa: F401
 
 OWN_GAME = Path(__file__).resolve().parents[2] / "examples/own_game.py"

@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from arcade_torch.agents.runs.files import is_final, read_csv
+from arcade_torch.agents.runs.files import read_csv
+from arcade_torch.agents.runs.final import is_final
 from arcade_torch.agents.runs.folder import RunFolder
 from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.figures.logs import Rate, curves_of_runs

@@ -17,7 +17,7 @@ import pytest
 from arcade_torch.agents import TrainConfig, train
 from arcade_torch.models import memory_names, registry
 from arcade_torch.tools import cli, imports
-from arcade_torch.tools.options import VARIABLE
+from arcade_torch.tools.imports import VARIABLE
 
 SOURCE = '''
 from pathlib import Path

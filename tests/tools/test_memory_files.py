@@ -6,7 +6,7 @@ import pytest
 
 from arcade_torch.models import registry
 from arcade_torch.tools import cli
-from arcade_torch.tools.options import VARIABLE
+from arcade_torch.tools.imports import VARIABLE
 
 LAWLESS = '''
 import torch

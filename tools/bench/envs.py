@@ -24,9 +24,8 @@ from arcade_torch.tools.bench.harness import Measure, interleaved
 from arcade_torch.tools.bench.registry import BenchOptions
 from arcade_torch.tools.options import at_least, at_most
 
-WINDOW_BYTES = 2**27
+WINDOW_BYTES = 2**27  # of the frames in a collector's window, at most, unless 4 steps need more
 LARGEST_BATCH = 2**20
-"""Pixels in a collector's window, at most, unless 4 steps need more."""
 
 
 @dataclass
@@ -59,23 +58,23 @@ def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dic
         log(f"{game}, {size} px, {count} envs")
         measures = {**_bare(game, size, count), **_bridge(game, size, count), **_plain(size, count)}
         measured = interleaved(measures, options.seconds, options.repeats)
-        drawn = {name: size * size * 3 * result.rate / 1e9 for name, result in measured.items()} | {
-            "step": 0.0
-        }
+        drawn = {name: size * size * 3 * result.rate / 1e9 for name, result in measured.items()}
+        drawn["step"] = 0.0
         for name, result in measured.items():
-            row: dict[str, Any] = {
+            row = {
                 "game": game,
                 "obs_size": size,
                 "num_envs": count,
                 "measure": name,
-            }
-            row |= {"frames": result.units, "frames_per_s": result.rate}
-            row |= {
+                "frames": result.units,
+                "frames_per_s": result.rate,
                 "frames_per_s_with_check": median(result.rates_with_check),
                 "gb_per_s": drawn[name],
+                "share_of_fill": drawn[name] / drawn["fill"],
+                "share_of_copy": drawn[name] / drawn["copy"],
+                "checksum": result.checksum,
             }
-            row |= {f"share_of_{base}": drawn[name] / drawn[base] for base in ("fill", "copy")}
-            yield "envs", row | {"checksum": result.checksum}
+            yield "envs", row
 
 
 def read_all(frames: Any) -> int:

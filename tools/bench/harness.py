@@ -68,9 +68,9 @@ def interleaved(
                 middle = timer()
                 into.checksum = (into.checksum + measure.check(result)) % 2**64
                 end = timer()
-                working = working + middle - start
-                checking = checking + end - middle
-                units = units + measure.units
+                working += middle - start
+                checking += end - middle
+                units += measure.units
             into.units += units
             into.rates.append(units / working)
             into.rates_with_check.append(units / (working + checking))

@@ -26,18 +26,17 @@ TORCH_GRU = "torch.nn.GRU"
 """It knows no starts and ignores them."""
 LOOP = "loop over unbind"
 COPY = "copy of as many bytes"
-FORWARD_TENSORS = 3
-BACKWARD_TENSORS = 5
-"""Tensors [B, T, H] a scan has to read or write: a, b, h; and a, h, the gradients of h, a and b."""
+# tensors [B, T, H] that a scan has to read or write
+FORWARD_TENSORS = 3  # a, b, h
+BACKWARD_TENSORS = 5  # a, h, the gradients of h, a and b
 RESETS = 0.02
 """Share of the steps that open an episode."""
 QUEUED = 10
 """Passes on a card between two looks at the clock, so that the device is timed and not the
 launches.
 """
-ACTING_ENVS = 16
-MINIBATCH_STEPS = 132
-"""The paper's envs, and the steps of its minibatch of them all: 128 and 4 before them."""
+ACTING_ENVS = 16  # the paper's
+MINIBATCH_STEPS = 132  # the paper's: 128, and 4 before them
 
 Run = Callable[..., Tensor]
 Key = TypeVar("Key")
@@ -73,9 +72,8 @@ def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dic
     batch = options.batch
     size = options.size
     at_least(options, steps=1, layers=1, size=1, batch=1, frames=1, threads=1, repeats=1)
-    if options.device != "cpu" and not (
-        options.device.startswith("cuda") and torch.cuda.is_available()
-    ):
+    on_card = options.device.startswith("cuda") and torch.cuda.is_available()
+    if options.device != "cpu" and not on_card:
         raise ValueError(
             f"device must be cpu, or cuda where torch finds a card, got {options.device!r}"
         )
@@ -90,15 +88,15 @@ def run(options: Options, log: Callable[[str], None]) -> Iterator[tuple[str, dic
                 torch.rand(batch, steps, device=device) < RESETS,
             )
             for (model, form), measured in time_passes(compared, _learn, inputs, *timing).items():
-                yield (
-                    "models",
-                    {"model": model, "form": form, "layers": layers, "steps": steps} | measured,
-                )
+                about = {"model": model, "form": form, "layers": layers, "steps": steps}
+                yield "models", about | measured
         for steps in options.steps:
             log(f"scans, T = {steps}")
-            yield from (("scans", row) for row in bench_scans(batch, steps, size, device, *timing))
+            for row in bench_scans(batch, steps, size, device, *timing):
+                yield "scans", row
         log("saliency")
-        yield from (("saliency", row) for row in bench_saliency(options.frames, device, *timing))
+        for row in bench_saliency(options.frames, device, *timing):
+            yield "saliency", row
 
 
 def forms(
@@ -186,7 +184,9 @@ def scan_forms(device: torch.device) -> tuple[str, ...]:
     """
     if device.type != "cuda":
         return "serial", "doubling", LOOP
-    return (*(["triton"] if runs_triton(torch.empty(0, device=device)) else []), "doubling", LOOP)
+    if runs_triton(torch.empty(0, device=device)):
+        return "triton", "doubling", LOOP
+    return "doubling", LOOP
 
 
 def solve(form: str, work: Callable[[], T]) -> Callable[[], T]:
@@ -202,7 +202,8 @@ def bench_scans(
     """
     doubles = {torch.float32: torch.float64, torch.complex64: torch.complex128}
     for numbers, (dtype, exact) in zip(("real", "complex"), doubles.items(), strict=True):
-        a, b = (torch.randn(batch, steps, size, dtype=dtype, device=device) for _ in "ab")
+        a = torch.randn(batch, steps, size, dtype=dtype, device=device)
+        b = torch.randn(batch, steps, size, dtype=dtype, device=device)
         a = a / a.abs().clamp_min(1e-3) * torch.rand(batch, steps, size, device=device)
         a[torch.rand(batch, steps, device=device) < RESETS] = 0
         compared: dict[str, Run] = {
@@ -213,23 +214,19 @@ def bench_scans(
         times = time_passes(compared, backward, (a, b), seconds, repeats, solve)
         for name, form in compared.items():
             error = float((solve(name, partial(form, a, b))() - right).abs().max())
-            yield (
-                {"form": name, "steps": steps, "numbers": numbers} | times[name] | {"error": error}
-            )
-        one, both = (
-            tensors * b.numel() // 2
-            for tensors in (FORWARD_TENSORS, FORWARD_TENSORS + BACKWARD_TENSORS)
-        )
+            about = {"form": name, "steps": steps, "numbers": numbers}
+            yield about | times[name] | {"error": error}
         # a copy reads and writes
-        source, target = (torch.zeros(both, dtype=dtype, device=device) for _ in "st")
+        forward = FORWARD_TENSORS * b.numel() // 2
+        both = (FORWARD_TENSORS + BACKWARD_TENSORS) * b.numel() // 2
+        source = torch.zeros(both, dtype=dtype, device=device)
+        target = torch.zeros(both, dtype=dtype, device=device)
         copies = {
-            "forward_ms": partial(target[:one].copy_, source[:one]),
-            "both_ms": partial(target.copy_, source),
+            "forward_ms": _repeated(partial(target[:forward].copy_, source[:forward]), device),
+            "both_ms": _repeated(partial(target.copy_, source), device),
         }
-        measured = interleaved(
-            {name: _repeated(copy, device) for name, copy in copies.items()}, seconds, repeats
-        )
-        least = {name: times.best_ms for name, times in measured.items()}
+        measured = interleaved(copies, seconds, repeats)
+        least = {name: result.best_ms for name, result in measured.items()}
         yield {"form": COPY, "steps": steps, "numbers": numbers} | least | {"error": 0.0}
 
 
@@ -290,9 +287,11 @@ def memory_cost(memory: nn.Module, input_size: int) -> MemoryCost:
         torch.no_grad(),
     ):
         memory(x, state, is_init)
-    state_size = sum(leaf.numel() for leaf in leaves), sum(leaf.nbytes for leaf in leaves)
     return MemoryCost(
-        sum(p.numel() for p in memory.parameters()), *state_size, counter.get_total_flops() // 2
+        parameters=sum(p.numel() for p in memory.parameters()),
+        state_numbers=sum(leaf.numel() for leaf in leaves),
+        state_bytes=sum(leaf.nbytes for leaf in leaves),
+        products=counter.get_total_flops() // 2,
     )
 
 

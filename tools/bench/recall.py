@@ -38,17 +38,13 @@ TOKENS = ASK + 1
 CUT = 0.25
 """Share of the episodes that end before they ask."""
 UNLABELLED = -100  # what cross_entropy leaves out
-SEQUENCES = 32
+SEQUENCES = 32  # of a batch
 LEARNING_RATE = 3e-3
-MAX_NORM = 1.0
-CHECK_EVERY = 25
-"""Of a batch; of Adam; of the gradient; steps between two looks at whether it is solved."""
+MAX_NORM = 1.0  # of the gradient
+CHECK_EVERY = 25  # gradient steps
 SOLVED = 0.99
-FIRST_LOOK = 200
-ANSWERS = 2000
-"""Answers in the test that decides whether the final one is worth its time, and in the final one,
-at least.
-"""
+FIRST_LOOK = 200  # answers, at least: few, to see whether the final test is worth its time
+ANSWERS = 2000  # of the final test, at least
 BEGIN = "<!-- recall -->"
 END = "<!-- end of recall -->"
 SYMBOL = "symbol"
@@ -275,8 +271,8 @@ def train(
             loss.backward()
             nn.utils.clip_grad_norm_(reader.parameters(), MAX_NORM)
             optimizer.step()
-        steps = steps + CHECK_EVERY
-        spent = spent + time.process_time() - began
+        steps += CHECK_EVERY
+        spent += time.process_time() - began
         if accuracy(reader, tests, delay, FIRST_LOOK)[0] >= SOLVED or spent >= seconds:
             right, answered = accuracy(reader, tests, delay, answers)
     parameters = sum(p.numel() for p in reader.parameters())
@@ -302,17 +298,19 @@ def accuracy(
 
 def markdown(rows: Sequence[Recall]) -> str:
     """The rows as a Markdown table: a line a model, a column a delay."""
-    lines = []
     delays = sorted({row.delay for row in rows})
-    for model, one in {row.model: row for row in rows}.items():
-        cells = dict.fromkeys(delays, "")
-        for row in (row for row in rows if row.model == model):
-            effort = f"{row.steps} steps, {row.seconds:.{0 if row.seconds >= 10 else 1}f} s"
-            solved = "" if row.accuracy >= SOLVED else "not solved: "
-            cells[row.delay] = f"{100 * row.accuracy:.1f} % ({solved}{effort})"
-        lines.append(
-            [f"`{model}`", *cells.values(), f"{one.parameters:,}", f"{one.state_numbers:,}"]
-        )
-    return markdown_table(
-        ["model", *(f"delay {delay}" for delay in delays), "parameters", "state"], lines
-    )
+    heads = ["model", *(f"delay {delay}" for delay in delays), "parameters", "state"]
+    lines = dict[str, list[str]]()
+    for row in rows:
+        sizes = [f"{row.parameters:,}", f"{row.state_numbers:,}"]
+        line = lines.setdefault(row.model, [f"`{row.model}`", *[""] * len(delays), *sizes])
+        line[1 + delays.index(row.delay)] = _in_words(row)
+    return markdown_table(heads, list(lines.values()))
+
+
+def _in_words(row: Recall) -> str:
+    """Per cent of right answers, and what they took."""
+    digits = 0 if row.seconds >= 10 else 1
+    solved = "" if row.accuracy >= SOLVED else "not solved: "
+    effort = f"{row.steps} steps, {row.seconds:.{digits}f} s"
+    return f"{100 * row.accuracy:.1f} % ({solved}{effort})"

@@ -78,24 +78,21 @@ def _config(network: str, memory: str, form: str, options: Options) -> TrainConf
     """The preset of that name without its random play, run in that form."""
     settings: dict[str, Any] = {}
     for name in form.split("+"):
-        require(
-            name in FORMS, "a form", form, f"{', '.join(FORMS)}, or several of them joined by '+'"
-        )
+        allowed = f"{', '.join(FORMS)}, or several of them joined by '+'"
+        require(name in FORMS, "a form", form, allowed)
         settings |= FORMS[name]
-    settings |= {
-        "algorithm": "pqn",
-        "env": options.env,
-        "memory": memory,
-        "observability": "partial",
-    }
-    config = preset(network, device=options.device, **settings)
-    most = config.learner.grad_steps_per_update
-    require(
-        options.grad_steps <= most,
-        "--grad-steps",
-        options.grad_steps,
-        f"at most {most} with the {network} network",
+    config = preset(
+        network,
+        algorithm="pqn",
+        env=options.env,
+        memory=memory,
+        observability="partial",
+        device=options.device,
+        **settings,
     )
+    most = config.learner.grad_steps_per_update
+    allowed = f"at most {most} with the {network} network"
+    require(options.grad_steps <= most, "--grad-steps", options.grad_steps, allowed)
     return dataclasses.replace(config, pqn=dataclasses.replace(config.pqn, warmup_steps=0))
 
 
@@ -122,19 +119,20 @@ def _measure(trainer: Trainer, form: str, options: Options) -> dict[str, Any]:
     measured = interleaved(measures, seconds=1e-9, repeats=options.repeats, warm_ups=1)
     collect_fps = measured["collect"].rate
     learn_fps = measured["learn"].rate
-    row: dict[str, Any] = {
+    shares = {f"learning: {kind}": share for kind, share in op_breakdown(learn).items()}
+    return {
         "network": trainer.config.network,
         "memory": trainer.config.memory,
         "form": form,
-    }
-    row |= {"parameters": sum(p.numel() for p in trainer.network.parameters())}
-    row |= {"num_envs": config.num_envs, "num_steps": config.num_steps, "grad_steps": every_step}
-    row |= {
+        "parameters": sum(p.numel() for p in trainer.network.parameters()),
+        "num_envs": config.num_envs,
+        "num_steps": config.num_steps,
+        "grad_steps": every_step,
         "collect_fps": collect_fps,
         "learn_fps": learn_fps,
         "train_fps": 1 / (1 / collect_fps + 1 / learn_fps),
+        **shares,
     }
-    return row | {f"learning: {kind}": value for kind, value in op_breakdown(learn).items()}
 
 
 KINDS = {
@@ -171,10 +169,16 @@ def op_breakdown(work: Callable[[], object]) -> dict[str, float]:
     on_card = sum(event.self_device_time_total for event in events)
     seconds = dict.fromkeys([*KINDS, REST], 0.0)
     for event in events:
-        kind = next(
-            (kind for kind, names in KINDS.items() if any(name in event.key for name in names)),
-            REST,
+        seconds[_kind_of(event.key)] += (
+            event.self_device_time_total if on_card else event.self_cpu_time_total
         )
-        seconds[kind] += event.self_device_time_total if on_card else event.self_cpu_time_total
     total = sum(seconds.values())
     return {kind: value / total for kind, value in seconds.items()}
+
+
+def _kind_of(operation: str) -> str:
+    """The first kind that an operation is of, by its name."""
+    for kind, names in KINDS.items():
+        if any(name in operation for name in names):
+            return kind
+    return REST

@@ -18,7 +18,7 @@ from arcade_torch.agents.config import GROUPS, Seed, TrainConfig
 from arcade_torch.agents.differences import flatten
 from arcade_torch.agents.runs.files import read_bytes, write_json
 from arcade_torch.envs_jax.registry import is_built_in, probe_ids, registered_ids
-from arcade_torch.tools.board.protocol import OBSERVATIONS, PROTOCOL, TWINS, Protocol
+from arcade_torch.tools.board.protocol import OBSERVATIONS, TWINS, Protocol
 
 MOST_BYTES = 4 * 2**20
 """Of the file of an entry, and of the record of a check."""
@@ -252,7 +252,7 @@ def check_checkpoints(place: Mapping[str, Any]) -> None:
         require(fits, f"checkpoints.{name}", repr(value)[:100], f"of the form {pattern.pattern}")
 
 
-def check_protocol(entry: Entry, protocol: Protocol = PROTOCOL) -> None:
+def check_protocol(entry: Entry, protocol: Protocol) -> None:
     """Refuse an entry that does not keep the protocol by what it says of itself.
 
     Raises:

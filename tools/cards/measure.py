@@ -31,9 +31,8 @@ from arcade_torch.tools.machine import torch_threads, versions
 FORMAT = 1
 WIDTHS = {"small": PRESETS["small"].hidden_size, "paper": PRESETS["paper"].hidden_size}
 """Widths of a cell in the networks of the presets."""
-LAW_SIZES = (8, 16)
-REACH_WIDTH = 32
-"""Of input and output: of the laws, and of what is measured in `reach`."""
+LAW_SIZES = (8, 16)  # of input and output, when laws are checked
+REACH_WIDTH = 32  # of input and output, for what `reach` measures
 RIVALS = ("gru", "lru")
 """What speed is compared with, in the same run and in turns."""
 DELAYS = (8, 32, 96)

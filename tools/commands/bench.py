@@ -37,14 +37,10 @@ class Bench(Command):
     def run(self) -> int:
         """Measure, print, save."""
         out = self.options.out
-        endings = (".csv",) if self.options.resumable else (".csv", ".json")
-        require(
-            out is None or out.suffix in endings,
-            "--out",
-            str(out),
-            f"a file that ends in {' or '.join(endings)}",
-        )
         if out is not None:
+            endings = (".csv",) if self.options.resumable else (".csv", ".json")
+            allowed = f"a file that ends in {' or '.join(endings)}"
+            require(out.suffix in endings, "--out", str(out), allowed)
             check_writable(out)
         results = registry.measure({self.name: self.options}, "one", _log)
         for name, table in results["tables"].items():

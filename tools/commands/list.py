@@ -1,6 +1,7 @@
 """``arcade-torch list``."""
 
 import inspect
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -47,8 +48,14 @@ class List(Command):
 
     def run(self) -> int:
         """Print the tables, or draw."""
-        for topic in ("envs", "memories") if self.topic == "all" else (self.topic,):
-            getattr(self, f"_{topic}")()
+        if self.topic in ("envs", "all"):
+            self._envs()
+        if self.topic in ("memories", "all"):
+            self._memories()
+        if self.topic == "baselines":
+            self._baselines()
+        if self.topic == "sheet":
+            self._sheet()
         return 0
 
     def resume_hint(self) -> str:
@@ -111,7 +118,6 @@ class List(Command):
     def _memories(self) -> None:
         from arcade_torch.models import make_memory, memory_names
         from arcade_torch.models.presets import PRESETS
-        from arcade_torch.tools.bench.memory import memory_cost, time_memories
 
         names = memory_names()
         rows = []
@@ -120,30 +126,31 @@ class List(Command):
             says = getattr(inspect.getmodule(kind), "__doc__", None) or kind.__doc__ or ""
             rows.append((name, says.strip().partition("\n")[0]))
         Table("memory models", ("name", "what it is"), rows, left=2).show()
-        columns = ["name", "parameters", "state", "state in bytes", "multiply-adds"]
-        columns += ["acting us", "learning us", "to the LRU's"] if self.measure else []
-        for of, size in (
-            ("the paper's network", PAPER_SIZE),
-            ("the small network", PRESETS["small"].hidden_size),
-        ):
-            times = time_memories(names, size) if self.measure else {}
-            costs = []
-            for name in names:
-                cost = [
-                    f"{number:,}" for number in memory_cost(make_memory(name, size, size), size)
-                ]
-                if self.measure:
-                    acting, learning = times[name]
-                    cost += [
-                        f"{acting:.1f}",
-                        f"{learning:.1f}",
-                        f"{learning / times['lru'][1]:.2f}",
-                    ]
-                costs.append([name, *cost])
-            Table(f"one cell of {of}, {size} wide", columns, costs).show()
+        self._costs("the paper's network", names, PAPER_SIZE)
+        self._costs("the small network", names, PRESETS["small"].hidden_size)
         print("multiply-adds: in matrix products, one step of one env, acting")
         if self.measure:
             print(
                 "us: microseconds for one step of one env; acting: 16 envs; learning: both passes, "
                 "16 x 132 steps"
             )
+
+    def _costs(self, network: str, names: Sequence[str], size: int) -> None:
+        """Print what one cell of every memory model costs in a network."""
+        from arcade_torch.models import make_memory
+        from arcade_torch.tools.bench.memory import memory_cost, time_memories
+
+        columns = ["name", "parameters", "state", "state in bytes", "multiply-adds"]
+        if self.measure:
+            columns += ["acting us", "learning us", "to the LRU's"]
+            times = time_memories(names, size)
+        rows = []
+        for name in names:
+            cost = memory_cost(make_memory(name, size, size), size)
+            row = [name, *map("{:,}".format, cost)]
+            if self.measure:
+                acting, learning = times[name]
+                ratio = learning / times["lru"][1]
+                row += [f"{acting:.1f}", f"{learning:.1f}", f"{ratio:.2f}"]
+            rows.append(row)
+        Table(f"one cell of {network}, {size} wide", columns, rows).show()

@@ -205,12 +205,8 @@ class Record(GameCommand):
         at_least(self, episodes=1, max_steps=1)
         self.check_scale()
         fastest = recording.FASTEST_FPS[self.out.suffix]
-        require(
-            0.01 <= self.fps <= fastest,
-            "--fps",
-            self.fps,
-            f"at least 0.01 and at most {fastest} for {self.out.suffix}",
-        )
+        allowed = f"at least 0.01 and at most {fastest} for {self.out.suffix}"
+        require(0.01 <= self.fps <= fastest, "--fps", self.fps, allowed)
         if self.player not in recording.SCRIPTED:
             import_again(agent_folder(self.player))  # which may register the game, too
         game_id = resolve_id(self.game)
@@ -249,12 +245,12 @@ class Record(GameCommand):
                 options=self.game_options(),
             )
         else:
-            scene = self.scene_of_agent()
+            scene = self._scene_of_player()
         if self.observability is not None:
             scene.partial = self.observability == "partial"
         return scene
 
-    def scene_of_agent(self) -> Scene:
+    def _scene_of_player(self) -> Scene:
         """What is recorded of a trained agent."""
         from arcade_torch.agents.runs.shipped import pretrained_names
         from arcade_torch.tools.play import recording

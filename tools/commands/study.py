@@ -52,14 +52,13 @@ class Resumable(Command):
         """Run a study, say how each run ended, and write the report; exit code 1 if a run
         failed.
         """
-        pairs = zip(self.argv, ("", *self.argv), strict=False)
-        argv = [
-            word for word, before in pairs if not word.startswith("--shard") and before != "--shard"
-        ]
+        argv = []
+        for word, before in zip(self.argv, ("", *self.argv), strict=False):
+            if not word.startswith("--shard") and before != "--shard":
+                argv.append(word)
+        command = command_line([self.word, *argv])
         try:
-            result = study(
-                definition, out, engine, command=command_line([self.word, *argv]), shard=shard
-            )
+            result = study(definition, out, engine, command=command, shard=shard)
         except DiskFullError as error:
             say(f"stopped: {error}; {self.resume_hint()}")
             return 1
@@ -144,9 +143,8 @@ class StudyCommand(Resumable):
         if self.check_memory:
             check_memories_of(definition)
         engine = make_engine(self.engine, self.workers, self.ray)
-        return self.carry_out(
-            definition, self.out or Path("runs") / definition.name, engine, self.shard, self.report
-        )
+        out = self.out or Path("runs") / definition.name
+        return self.carry_out(definition, out, engine, self.shard, self.report)
 
 
 @dataclass

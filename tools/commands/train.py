@@ -69,28 +69,28 @@ class Train(Command):
         if "preset" in given and "config" in given:
             raise ValueError("give --preset or --config to start from, not both")
         if "config" in given:
-            parsed = parse_options(cls, argv, prog, cls(_read_config(Path(given["config"]))))
-            settings = parsed.settings
+            start = _read_config(Path(given["config"]))
         else:
             # A preset's numbers depend on these two, and the help shows them.
             decisive: dict[str, Any] = {
                 name: given[name] for name in ("env", "algorithm") if given.get(name)
             }
-            parsed = parse_options(
-                cls, argv, prog, cls(preset(given.get("preset", "paper"), **decisive))
-            )
+            start = preset(given.get("preset", "paper"), **decisive)
+        parsed = parse_options(cls, argv, prog, cls(start))
+        settings = parsed.settings
+        if "config" not in given:
             names = {name.partition(".")[0].removeprefix("no_") for name in given}
-            chosen = {
-                name: getattr(parsed.settings, name)
-                for name in names & {f.name for f in fields(TrainConfig)}
-            }
+            names &= {setting.name for setting in fields(TrainConfig)}
+            chosen = {name: getattr(settings, name) for name in names}
             settings = preset(parsed.preset, **chosen)
-        options = {"env_options": parsed.env_option, "network_options": parsed.network_option}
-        more = {
-            key: {**getattr(settings, key), **dict(map(name_and_value, pairs))}
-            for key, pairs in options.items()
-        }
-        return replace(parsed, settings=replace(settings, **more))
+        of_env = dict(map(name_and_value, parsed.env_option))
+        of_network = dict(map(name_and_value, parsed.network_option))
+        settings = replace(
+            settings,
+            env_options={**settings.env_options, **of_env},
+            network_options={**settings.network_options, **of_network},
+        )
+        return replace(parsed, settings=settings)
 
     def run(self) -> int:
         """Train."""

@@ -12,7 +12,7 @@ from arcade_torch.agents import preset
 from arcade_torch.agents.checked import require
 from arcade_torch.agents.config import TrainConfig
 from arcade_torch.agents.differences import flatten
-from arcade_torch.agents.runs.files import write_atomic
+from arcade_torch.agents.runs.files import read_csv, write_atomic
 from arcade_torch.tools.comparable import find_runs
 from arcade_torch.tools.figures import (
     CurveOptions,
@@ -23,7 +23,7 @@ from arcade_torch.tools.figures import (
     TableOptions,
     style,
 )
-from arcade_torch.tools.files import markdown_table, read_csv, read_rows
+from arcade_torch.tools.files import markdown_table, read_rows
 from arcade_torch.tools.measures.bootstrap import Array, Pooled, pooled
 from arcade_torch.tools.names import plain_number
 from arcade_torch.tools.runs import Run

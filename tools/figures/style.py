@@ -333,12 +333,11 @@ def svg(figure: Any, name: str) -> str:
     return text.replace("<svg", f'<svg role="img" aria-label="{escape(printable(name))}"', 1)
 
 
-def png(figure: Any, colours: int = 128) -> bytes:
-    """A figure as a small PNG file, its colours counted."""
+def png(figure: Any) -> bytes:
+    """A figure as a small PNG file of 128 colours."""
     buffer = BytesIO()
     packed = BytesIO()
     save_figure(figure, buffer, format="png", dpi=150)
-    need("PIL.Image").open(buffer).convert("RGB").quantize(colours).save(
-        packed, "PNG", optimize=True
-    )
+    picture = need("PIL.Image").open(buffer).convert("RGB").quantize(128)
+    picture.save(packed, "PNG", optimize=True)
     return packed.getvalue()

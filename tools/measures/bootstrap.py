@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+DRAWS = 2000  # of an interval over seeds
 
 
 class Interval(NamedTuple):
@@ -113,9 +114,7 @@ class Pooled(NamedTuple):
     high: Array
 
 
-def pooled(
-    values: Sequence[Any], confidence: float = 0.95, draws: int = 2000, seed: int = 0
-) -> Pooled:
+def pooled(values: Sequence[Any], confidence: float = 0.95) -> Pooled:
     """Pool the arrays of some seeds, cell by cell.
 
     NaN or infinite is a seed without a value. The ends are NaN where fewer than two seeds have one,
@@ -127,7 +126,7 @@ def pooled(
         finite = np.sort(seeds[np.isfinite(seeds)])
         if finite.size < 2:
             return np.array([finite[0] if finite.size else np.nan, np.nan, np.nan])
-        drawn = mean_over_tasks(resampled([finite], draws, np.random.default_rng(seed)))
+        drawn = mean_over_tasks(resampled([finite], DRAWS, np.random.default_rng(0)))
         return np.array(percentile_interval(mean_over_tasks([finite]), drawn, confidence))
 
     all_seeds = np.array(values, dtype=np.float64)
@@ -135,9 +134,7 @@ def pooled(
     return Pooled(all_seeds, mean, low, high)
 
 
-def pooled_episodes(
-    seeds: Sequence[Any], confidence: float = 0.95, draws: int = 2000, seed: int = 0
-) -> Pooled:
+def pooled_episodes(seeds: Sequence[Any], confidence: float = 0.95) -> Pooled:
     """Pool the episodes of some seeds, each [n_episodes, L], column by column: the mean over seeds
     of their means over episodes, both resampled.
 
@@ -149,7 +146,7 @@ def pooled_episodes(
     means = np.full((len(arrays), columns), np.nan)
     ends = np.full((3, columns), np.nan)
     for column in range(columns):
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         finite = [episodes[np.isfinite(episodes[:, column]), column] for episodes in arrays]
         for place, values in enumerate(finite):
             means[place, column] = values.mean() if values.size else np.nan
@@ -157,9 +154,9 @@ def pooled_episodes(
         if not cells:
             continue
         estimate = float(np.mean([values.mean() for values in cells]))
-        of_seeds = np.array([drawn.mean(axis=1) for drawn in resampled(cells, draws, rng)])
-        chosen = rng.integers(len(cells), size=(draws, len(cells)))
-        drawn = rng.integers(draws, size=chosen.shape)
+        of_seeds = np.array([drawn.mean(axis=1) for drawn in resampled(cells, DRAWS, rng)])
+        chosen = rng.integers(len(cells), size=(DRAWS, len(cells)))
+        drawn = rng.integers(DRAWS, size=chosen.shape)
         several = sum(values.size for values in cells) > 1
         values = of_seeds[chosen, drawn].mean(axis=1)
         ends[:, column] = percentile_interval(estimate, values, confidence, several)
@@ -174,7 +171,6 @@ def measured_coverage(
     confidence: float = 0.95,
     simulations: int = 2000,
     draws: int = 500,
-    seed: int = 0,
 ) -> float:
     """Share of simulated studies whose interval for Gap holds the true Gap, with a standard error
     of about 0.01.
@@ -184,7 +180,7 @@ def measured_coverage(
     below the nominal confidence; a report says so beside its intervals. Large studies are simulated
     less often, so that this takes about a second.
     """
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     cost = draws * sum(mdp_seeds + pomdp_seeds)
     simulations = max(200, min(simulations, int(4e7 / cost)))
     gaps = np.zeros((simulations, draws))  # the true one is 0

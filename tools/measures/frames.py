@@ -19,14 +19,14 @@ COLOURS = ((90, 160, 255), (255, 200, 60), (90, 220, 120), (255, 100, 100), (200
 """Of the channels of frames that have neither one nor three of them."""
 
 
-def channel_axis(shape: Sequence[int], channels: Channels | None = None) -> int | None:
+def channel_axis(shape: Sequence[int], channels: Channels | None) -> int | None:
     """Which axis of a frame holds its channels: 0, -1, or None where it has no three axes.
 
     Without ``channels`` it is the shorter end of the shape, the last of two that are equal.
 
     Example:
-        >>> channel_axis((84, 84, 3)), channel_axis((1, 84, 84)), channel_axis((84, 84))
-        (-1, 0, None)
+        >>> channel_axis((84, 84, 3), None), channel_axis((1, 84, 84), None)
+        (-1, 0)
     """
     if len(shape) != 3:
         return None

@@ -55,7 +55,7 @@ class Keys:
     is_init: Key = "is_init"
 
 
-def action_index(action: Tensor, name: Key = "action") -> Tensor:
+def action_index(action: Tensor, name: Key) -> Tensor:
     """Actions, categorical [N] or [N, 1] or one-hot [N, A], as int64 [N].
 
     Raises:

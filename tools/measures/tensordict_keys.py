@@ -92,7 +92,8 @@ def find_state_keys(
         return {unravel_key(key): unravel_key(after) for key, after in named.items()}
     written = unravelled(module.out_keys)
     keys = dict[Key, Key]()
-    for key in module.in_keys if named is None else named:
+    candidates = module.in_keys if named is None else named
+    for key in candidates:
         after = unravel_key(("next", key))
         if named is not None or after in written:
             keys[unravel_key(key)] = after

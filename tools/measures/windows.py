@@ -115,9 +115,7 @@ def greedy_window(
     return window
 
 
-def check_episodes(
-    episodes: Any, seed: Any, end: Any = "last", cap: Any = MAX_STEPS, twin: Any = None
-) -> None:
+def check_episodes(episodes: Any, seed: Any, end: Any, cap: Any, twin: Any = None) -> None:
     """Refuse what `greedy_windows` could not play, and an unknown twin (ValueError)."""
     require(end in get_args(End), "end", end, f"one of {', '.join(get_args(End))}")
     check_played(seed, twin, episodes=(episodes, 1), cap=(cap, MIN_STEPS))

@@ -28,11 +28,10 @@ SCRIPTED = ("random", "state-oracle", "frames-oracle")
 FASTEST_FPS = {".gif": 50, ".mp4": 240}  # a GIF shows a frame for 2 hundredths of a second or more
 # Quality of x264: 0 is lossless, 23 its default. Most players want this pixel format.
 _ENCODING = ("-c:v", "libx264", "-crf", "14", "-pix_fmt", "yuv420p", "-movflags", "+faststart")
+# of films of a training
 FILM_FPS = 10
-FILM_SEED = 2**31
-"""Of films of a training. The seed is far from those of training and always the same, so that films
-compare.
-"""
+FILM_STEPS = 500
+FILM_SEED = 2**31  # far from those of training, and always the same, so that films compare
 GAP = 8
 """Between pictures on a sheet or a strip, in pixels."""
 
@@ -146,39 +145,38 @@ def write_mp4(path: Path, frames: Iterable[Frame], fps: float) -> Path:
         return write_atomic(path, film.read_bytes())
 
 
-def _moments(id: str, obs_size: int, seed: int, steps: int) -> Iterator[list[Frame]]:
+def _moments(id: str, obs_size: int, steps: int) -> Iterator[list[Frame]]:
     """Both twins of each state of an episode of the scripted player, from the first to that after
     `steps`, or to the last before the end; of a random one where there is no player that sees the
     state.
     """
-    session = Session(compiled_game(id, obs_size, "default", {}), seed=seed)
+    session = Session(compiled_game(id, obs_size, "default", {}), seed=0)
     player = "state-oracle" if "state" in session.game.oracles else "random"
-    choose = scripted(player, session.game, seed)
+    choose = scripted(player, session.game, 0)
     while session.end is None and session.steps <= steps:
         yield [session.view(partial=False)[0], session.view(partial=True)[0]]
         session.press(ACTION_NAMES[choose(session)])
 
 
-def scene(id: str, obs_size: int, steps: int = 60, seed: int = 0) -> list[Frame]:
+def scene(id: str, obs_size: int, steps: int = 60) -> list[Frame]:
     """Both twins of one moment in the middle of a game, played by the scripted player that sees the
     state.
     """
     middle = make(id, obs_size=obs_size).max_steps // 4
-    *_, last = _moments(id, obs_size, seed, min(steps, middle))
+    *_, last = _moments(id, obs_size, min(steps, middle))
     return last
 
 
-def strip(id: str, steps: Sequence[int], obs_size: int = 256, seed: int = 0) -> Frame:
+def strip(id: str, steps: Sequence[int], obs_size: int = 256) -> Frame:
     """Some moments of one episode side by side, the MDP twin above the POMDP twin, each row under
     its name.
     """
     rises = bool(steps) and steps[0] >= 0 and all(a < b for a, b in pairwise(steps))
     require(rises, "steps", list(steps), "whole numbers that rise from 0 or more")
-    moments = list(_moments(id, obs_size, seed, steps[-1]))
+    moments = list(_moments(id, obs_size, steps[-1]))
     if len(moments) <= steps[-1]:
         raise ValueError(
-            f"the scripted episode of {id} with seed {seed} ends after {len(moments)} steps: stay "
-            "below"
+            f"the scripted episode of {id} with seed 0 ends after {len(moments)} steps: stay below"
         )
     rows = list[Frame]()
     for twin, name in enumerate(TWINS.values()):
@@ -225,10 +223,9 @@ class EvaluationVideos:
     it. A film that fails is reported in a warning, and it was the last.
     """
 
-    def __init__(self, folder: Path, suffix: str = ".gif", max_steps: int = 500) -> None:
+    def __init__(self, folder: Path, suffix: str = ".gif") -> None:
         self.folder = folder
         self.suffix = suffix
-        self.max_steps = max_steps
         self._write = writer_for(folder / f"film{suffix}")
         self._failed = False
 
@@ -261,5 +258,5 @@ class EvaluationVideos:
             episodes=1,
         )
         player = trained(agent, partial)
-        frames = recorded_frames(session, player, max_steps=self.max_steps, hold=FILM_FPS, scale=2)
+        frames = recorded_frames(session, player, max_steps=FILM_STEPS, hold=FILM_FPS, scale=2)
         self._write(path, frames, FILM_FPS)

@@ -42,7 +42,7 @@ _WHOLE = re.compile(r"[0-9]{1,10}")
 
 
 def score_row(
-    attempt: Attempt, game: Game[Any], options: Mapping[str, Any], player: str = ""
+    attempt: Attempt, game: Game[Any], options: Mapping[str, Any], player: str
 ) -> dict[str, Any]:
     """One line of the table."""
     env = game_of(game.id)
@@ -75,12 +75,8 @@ def read_scores_file(path: Path) -> list[dict[str, str]]:
             f"{path} is no table of human scores, and adding one would lose what it holds"
         )
     for row in rows:
-        require(
-            _WHOLE.fullmatch(row["seed"]) is not None,
-            f"{path}: the seed",
-            row["seed"],
-            "a whole number",
-        )
+        is_whole = _WHOLE.fullmatch(row["seed"]) is not None
+        require(is_whole, f"{path}: the seed", row["seed"], "a whole number")
     return rows
 
 
@@ -107,12 +103,8 @@ def replay(row: Mapping[str, Any]) -> Attempt:
     """
     attempts = list[Attempt]()
     actions = row["actions"]
-    require(
-        re.fullmatch(r"[0-4]+", actions) is not None,
-        "actions",
-        actions,
-        "digits from 0 to 4, one a step",
-    )
+    are_digits = re.fullmatch(r"[0-4]+", actions) is not None
+    require(are_digits, "actions", actions, "digits from 0 to 4, one a step")
     for name in ("seed", "obs_size"):
         require(_WHOLE.fullmatch(str(row[name])) is not None, name, row[name], "a whole number")
     _, options = name_and_value(f"options={row['options']}")

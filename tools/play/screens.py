@@ -123,7 +123,7 @@ class Watched:
 
 
 def play_in_window(
-    session: Session, scale: int = 2, key_repeat_ms: int = 0, watched: Watched | None = None
+    session: Session, scale: int, key_repeat_ms: int, watched: Watched | None = None
 ) -> None:
     """Show a session and hand it the keys, until it is closed; of somebody who is ``watched``
     too.

@@ -207,14 +207,10 @@ class Session:
             self._report("abandoned")
 
     def _report(self, end: End) -> None:
-        twin = (
-            "both"
-            if self.both
-            else "mixed"
-            if self._mixed
-            else "partial"
-            if self.partial
-            else "full"
-        )
+        twin = "partial" if self.partial else "full"
+        if self._mixed:
+            twin = "mixed"
+        if self.both:
+            twin = "both"
         actions = "".join(map(str, self._actions))
         self._on_attempt(Attempt(self.seed, self._attempt, twin, actions, self.total, end))

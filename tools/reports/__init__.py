@@ -285,7 +285,8 @@ def _vanishing(
     for strip in strips:
         if strip["warning"]:
             names.append(f"{strip['agent']} on {strip['game']} {TWIN_NAMES[strip['twin']]}")
-    for row in exchanges["rows"] if exchanges is not None else ():
+    rows = exchanges["rows"] if exchanges is not None else ()
+    for row in rows:
         if row["saturated"]:
             names.append(f"{row['agent']} on {row['game']} {row['twin']}")
     return list(dict.fromkeys(names))

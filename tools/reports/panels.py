@@ -42,21 +42,20 @@ def select_cells(runs: Runs, finals: Finals, baseline: str, subject: str = "") -
     if bare:
         notes.append(f"{bare} run{'s' * (bare > 1)} without a checkpoint cannot be looked into.")
     seeds = f"the first {MOST_SEEDS} of {most_seeds} seeds" if most_seeds > MOST_SEEDS else ""
-    if len(cells) <= MOST_CELLS:
-        if seeds:
-            notes.append(f"Shown: {seeds} of each agent.")
-        return cells, " ".join(notes)
-    agents, games = representatives(finals, baseline, subject)
-    all_agents = {agent for agent, _, _ in cells}
-    all_games = {game for _, game, _ in cells}
-    selection = f"{' and '.join(agents)} on {', '.join(games)}"
-    if seeds:
-        selection += f", {seeds}"
-    best = "the memory with the highest mean return where observations are partial"
+    all_agents = list(dict.fromkeys(agent for agent, _, _ in cells))
+    all_games = list(dict.fromkeys(game for _, game, _ in cells))
+    agents = all_agents
+    games = all_games
+    if len(cells) > MOST_CELLS:
+        agents, games = representatives(finals, baseline, subject)
     if (len(agents), len(games)) == (len(all_agents), len(all_games)):
         if seeds:
             notes.append(f"Shown: {seeds} of each agent.")
         return cells, " ".join(notes)
+    selection = f"{' and '.join(agents)} on {', '.join(games)}"
+    if seeds:
+        selection += f", {seeds}"
+    best = "the memory with the highest mean return where observations are partial"
     notes.append(
         f"Shown: {selection}, out of {len(all_agents)} agents and {len(all_games)} games: "
         f"{f'{subject}, ' if subject else ''}{best}, beside the memory-free agent, on the games "

@@ -149,7 +149,9 @@ class StudyFolder:
 
     def _check_empty(self) -> None:
         """Refuse a folder of other files than those that another shard writes as it begins."""
-        for path in self.root.iterdir() if self.root.exists() else ():
+        if not self.root.exists():
+            return
+        for path in self.root.iterdir():
             is_ours = path.name.startswith(".study.json.") or path.name in _BEGINS_WITH
             if not is_ours or path.is_symlink():
                 raise FileExistsError(

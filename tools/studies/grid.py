@@ -195,8 +195,7 @@ class Study:
         """Refuse a memory-free agent that the study does not train: there would be no Bias to
         report.
         """
-        agents = product(self.algorithms, self.memories)
-        names = list(agent_names(AgentKey(*agent) for agent in agents).values())
+        names = self._agent_names()
         if not find_baselines(names, self.baseline):
             raise ValueError(
                 f"baseline = {self.baseline!r} is none of the agents that this study trains, "
@@ -207,15 +206,17 @@ class Study:
         """Refuse a subject that the study does not train; an empty one is none."""
         if not self.subject:
             return
-        agents = product(self.algorithms, self.memories)
-        names = list(agent_names(AgentKey(*agent) for agent in agents).values())
-        for run in self.runs():
-            names.append(run.agent)
+        names = self._agent_names() + [run.agent for run in self.runs()]
         if self.subject not in (*self.memories, *names):
             raise ValueError(
                 f"subject = {self.subject!r} is none of the agents that this study trains, "
                 f"{', '.join(dict.fromkeys(names))}"
             )
+
+    def _agent_names(self) -> list[str]:
+        """What the agents that the study trains are called, whatever their size."""
+        agents = product(self.algorithms, self.memories)
+        return list(agent_names(AgentKey(*agent) for agent in agents).values())
 
     def overridden_preset(self) -> str:
         """Say in one line that the study trains another algorithm than its preset; empty where it
@@ -248,8 +249,8 @@ class Study:
         """
         agents = list[tuple[str, str]]()
         for memory in self.memories:
-            sized = bool(self.sizes) and memory != self.baseline
-            for size in self.sizes if sized else ("",):
+            sizes = self.sizes if memory != self.baseline else ()
+            for size in sizes or ("",):
                 agents.append((memory, size))
         cells = product(self.seeds, self.games, self.algorithms, agents, self.observability)
         runs = []

@@ -132,9 +132,9 @@ def study(
         jobs = {run: folder.job(run) for run in plan if folder.run(run).final is None}
         for run, job in jobs.items():
             write_json(job.config, plan[run].to_dict())
-        errors = (
-            _carry_out(results, list(plan), list(jobs.values()), engine, stream) if jobs else {}
-        )
+        errors = dict[str, str]()
+        if jobs:
+            errors = _carry_out(results, list(plan), list(jobs.values()), engine, stream)
         return StudyResult(folder.root, results.write(), errors)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):
@@ -284,9 +284,8 @@ def _watch(
     runs = {run.name: run for run in plan}
     errors = dict[str, str]()
     ended = set(runs) - {job.name for job in jobs}
-    bars = progress_bars(
-        results.study.name, {name: folder.run(run) for name, run in runs.items()}, ended, stream
-    )
+    folders = {name: folder.run(run) for name, run in runs.items()}
+    bars = progress_bars(results.study.name, folders, ended, stream)
     with bars as note, contextlib.closing(engine.run(jobs)) as ends:  # type: ignore[type-var]
         if ended:
             note(f"{len(ended)} of {len(runs)} runs are finished already")
@@ -326,7 +325,7 @@ def _still_failed(
 
 @contextlib.contextmanager
 def progress_bars(
-    title: str, runs: Mapping[str, Run], ended: set[str], stream: Any = None
+    title: str, runs: Mapping[str, Run], ended: set[str], stream: Any
 ) -> Iterator[Callable[[str], None]]:
     """Show how far a study is, from the ``progress.json`` of its runs, a bar for all and one for
     each run at work.

@@ -17,7 +17,7 @@ from arcade_torch.agents.runs.checkpoint import (
     load_latest,
     save_checkpoint,
 )
-from arcade_torch.agents.runs.files import CsvLog, read_csv
+from arcade_torch.agents.runs.files import CsvLog, read_log
 
 CONFIG = preset("smoke")
 
@@ -164,7 +164,7 @@ def test_code_hidden_in_a_checkpoint_is_not_run(tmp_path):
 def test_of_a_log_only_whole_lines_are_read_and_a_newer_version_may_have_other_columns(tmp_path):
     file = tmp_path / "m.csv"
     file.write_text("frames,x,old\n10,1,2\n20\n30,1,2,3\nabc,1,2\n40,3,4\n50,5,")
-    assert [row["frames"] for row in read_csv(file, strict=False)] == ["10", "40"]
+    assert [row["frames"] for row in read_log(file)] == ["10", "40"]
     log = CsvLog(file, ("frames", "new", "x"), keep_frames=50)
     log.append({"frames": 50, "new": 7, "x": 8})
     log.close()
@@ -181,5 +181,5 @@ def test_a_log_is_cut_back_to_a_frame_count(tmp_path):
     again = CsvLog(tmp_path / "m.csv", ("frames", "x"), keep_frames=20)
     again.append({"frames": 30, "x": None})
     again.close()
-    rows = [(r["frames"], r["x"]) for r in read_csv(tmp_path / "m.csv", strict=False)]
+    rows = [(r["frames"], r["x"]) for r in read_log(tmp_path / "m.csv")]
     assert rows == [("10", "3.3333333"), ("20", "6.6666667"), ("30", "")]

@@ -25,6 +25,7 @@ from arcade_torch.agents.runs.files import (
     checksum,
     read_csv,
     read_json,
+    read_log,
     write_atomic,
     write_json,
 )
@@ -35,7 +36,7 @@ CONFIG: TrainConfig = preset("smoke")
 READERS = {
     "json": read_json,
     "csv": read_csv,
-    "log": lambda path: read_csv(path, strict=False),
+    "log": read_log,
     "sum": checksum,
 }
 

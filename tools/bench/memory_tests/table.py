@@ -18,10 +18,9 @@ __all__ = ["BEGIN", "END", "Cell", "Row", "cells", "columns", "markdown", "measu
 BEGIN = "<!-- memory tests -->"
 END = "<!-- end of memory tests -->"
 
-SOLVED = 0.95
-AT_CHANCE = 0.05
-"""Of the share of what a guess misses, the mean over seeds: from here on solved; up to here
-chance."""
+# of what a guess misses, the share that is right, as a mean over seeds
+SOLVED = 0.95  # from here on
+AT_CHANCE = 0.05  # up to here
 
 
 class Row(NamedTuple):
@@ -113,14 +112,14 @@ def columns(rows: Sequence[Row]) -> list[tuple[MemoryTest, int]]:
     return pairs
 
 
-def cells(rows: Sequence[Row], confidence: float = 0.95) -> dict[tuple[str, str, int], Cell]:
-    """Model, test and size -> the mean over seeds, with its interval."""
+def cells(rows: Sequence[Row]) -> dict[tuple[str, str, int], Cell]:
+    """Model, test and size -> the mean over seeds, with its 95 % interval."""
     shares: dict[tuple[str, str, int], list[float]] = {}
     for row in rows:
         shares.setdefault((row.model, row.test, row.level), []).append(row.accuracy)
     table = {}
     for key, values in shares.items():
-        over_seeds = pooled(values, confidence)
+        over_seeds = pooled(values)
         chance = float(TESTS[key[1]].chance)
         mean = float(over_seeds.mean)
         ends = (float(over_seeds.low), float(over_seeds.high))

@@ -163,7 +163,9 @@ class Directions:
         self.alive = np.arange(steps) < recording.lengths[:, None]
         self.facts = dict[str, NDArray[Any]]()  # [E, T, C]
         self.targets = dict[str, Targets]()
-        for name, values in recording.facts.items() if recording.states.shape[-1] else ():
+        if not recording.states.shape[-1]:
+            return  # nothing to steer
+        for name, values in recording.facts.items():
             flat = flat_fact(values, 2)
             present = flat[self.alive & exists(flat)]
             if len(present) and (present != present[0]).any():

@@ -195,7 +195,7 @@ def _figure(
     agents: Mapping[str, Measures],
     first: measure.Contamination,
     options: ContaminationOptions,
-    title: str = "",
+    title: str,
 ) -> Any:
     """One row a measure, one column a strength of the noise; the dashed line is an agent without
     memory.

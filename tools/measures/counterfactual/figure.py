@@ -254,7 +254,7 @@ class OfCell(NamedTuple):
 
 
 def counterfactual_section(
-    cells: Cells, agents: Sequence[str], progress: Progress | None, gradients: bool = True
+    cells: Cells, agents: Sequence[str], progress: Progress | None, gradients: bool
 ) -> dict[str, Any]:
     """Exchanges of every cell, a picture a task; numbers are kept in the run folders.
 

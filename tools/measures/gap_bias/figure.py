@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.envs_jax.registry import DIFFICULTIES
 from arcade_torch.tools.comparable import Runs, find_runs
 from arcade_torch.tools.figures import Made, PaperOptions, Picture, Progress, style
@@ -24,7 +25,7 @@ from arcade_torch.tools.figures.style import (
     seeds_note,
     whiskers,
 )
-from arcade_torch.tools.files import Table, read_csv
+from arcade_torch.tools.files import Table
 from arcade_torch.tools.measures.bootstrap import Interval, measured_coverage
 from arcade_torch.tools.measures.gap_bias import ScoreOptions, SweepOptions
 from arcade_torch.tools.measures.gap_bias.measure import (

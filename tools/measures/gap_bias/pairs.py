@@ -38,14 +38,13 @@ class Pair(NamedTuple):
     difference: Interval  # subject_return - other_return
 
 
-def pairs(scores: Sequence[Score], subject: str, draws: int = DRAWS, seed: int = 0) -> list[Pair]:
+def pairs(scores: Sequence[Score], subject: str, draws: int = DRAWS) -> list[Pair]:
     """Compare an agent with every other on the tasks that both have.
 
     Args:
         scores: of the runs, with the names of the agents.
         subject: name of the one agent.
         draws: of the bootstrap.
-        seed: of the draws.
 
     Returns:
         Task by task, then the mean over the MDPs, over the POMDPs and over both.
@@ -57,7 +56,7 @@ def pairs(scores: Sequence[Score], subject: str, draws: int = DRAWS, seed: int =
             returns.setdefault(score.agent, {}).setdefault(task, []).append(score.value)
     agents = dict[str, Cells]()
     for name, by_task in returns.items():
-        agents[name] = _cells(name, by_task, draws, seed)
+        agents[name] = _cells(name, by_task, draws)
     mine = agents.pop(subject, {})
     rows = list[Pair]()
     for game, twin in mine:
@@ -70,12 +69,12 @@ def pairs(scores: Sequence[Score], subject: str, draws: int = DRAWS, seed: int =
     return rows
 
 
-def _cells(agent: str, returns: Mapping[Task, Sequence[float]], draws: int, seed: int) -> Cells:
+def _cells(agent: str, returns: Mapping[Task, Sequence[float]], draws: int) -> Cells:
     """The returns of an agent with their resamples."""
     cells = Cells()
     for (game, twin), values in returns.items():
         seeds = np.array(values, dtype=np.float64)
-        (drawn,) = resampled([seeds], draws, generator_of(seed, agent, game, twin))
+        (drawn,) = resampled([seeds], draws, generator_of(0, agent, game, twin))
         cells[game, twin] = normalise(game, np.vstack([seeds, drawn]))
     return cells
 

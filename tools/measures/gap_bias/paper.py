@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from arcade_torch.tools.files import Table, read_csv
+from arcade_torch.agents.runs.files import read_csv
+from arcade_torch.tools.files import Table
 from arcade_torch.tools.measures.bootstrap import Interval
 from arcade_torch.tools.measures.gap_bias.measure import (
     SIGNED_GAMES,

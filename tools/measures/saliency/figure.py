@@ -224,7 +224,7 @@ def no_gradient(episode: EpisodeSaliency, norm: str = "l2sq") -> str:
     return vanishing(episode.target, episode.output.max(), episode.per_frame.sum(), norm)
 
 
-def vanishing(target: str, certainty: float, total: float, norm: str = "l2sq") -> str:
+def vanishing(target: str, certainty: float, total: float, norm: str) -> str:
     """Why shares of gradients say nothing, or an empty text if they do.
 
     Args:
