@@ -103,6 +103,19 @@ def test_reference_lines_and_intervals_are_on_the_page(page: str) -> None:
     assert "memory narrows the observability gap by 0.05" in page
 
 
+def test_returns_out_of_the_common_scale_are_named_above_all_numbers(
+    page: str, tmp_path: Path, no_oracles: None
+) -> None:
+    words = "returns of MineSweeperEasy lie outside of [0, 1] and count as they are"
+    assert words not in page
+    what = small_study()
+    folder = write_study(tmp_path / "wide", what)
+    for run in what.runs():
+        write_run(folder.run(run).path, run, 7.0, settings=what.config(run).to_dict())
+    wide = report(tmp_path / "wide", skip=("saliency",)).read_text()
+    assert words in wide.partition('id="learning"')[0]
+
+
 def test_an_unfinished_study_is_reported_as_such(tmp_path: Path, no_oracles: None) -> None:
     what = small_study()
     folder = write_study(tmp_path / "s", what)

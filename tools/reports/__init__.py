@@ -21,7 +21,12 @@ from arcade_torch.tools.measures.bootstrap import pooled
 from arcade_torch.tools.measures.contamination import figure as contamination
 from arcade_torch.tools.measures.counterfactual import figure as counterfactual
 from arcade_torch.tools.measures.gap_bias import figure as gap_bias
-from arcade_torch.tools.measures.gap_bias.measure import GapBias, gap_and_bias, normalise
+from arcade_torch.tools.measures.gap_bias.measure import (
+    GapBias,
+    gap_and_bias,
+    normalise,
+    range_note,
+)
 from arcade_torch.tools.measures.recall_density import figure as recall_density
 from arcade_torch.tools.measures.saliency import figure as saliency
 from arcade_torch.tools.measures.section import Cells
@@ -393,9 +398,12 @@ def _scores(
     """
     tables = dict[str, GapBias]()
     trouble = ""
+    wide = ""
     for name in sorted(METRICS, key=lambda name: name != metric):
         try:
-            tables[name] = gap_and_bias(runs.scores(name), metric=name, baseline=study.baseline)
+            scores = runs.scores(name)
+            wide = wide or range_note(scores, sorted({score.game for score in scores}))
+            tables[name] = gap_and_bias(scores, metric=name, baseline=study.baseline)
             folder.keep_table(f"gap_bias_{name}.csv", tables[name].table())
         except ValueError as error:
             trouble = trouble or str(error)
@@ -405,6 +413,7 @@ def _scores(
     second = [tables[name] for name in tables if name != metric]
     return {
         "trouble": trouble,
+        "wide": wide,
         "table": table,
         "second": second[0] if second else None,
         "sentences": score_sentences(table, subject) if table is not None else [],

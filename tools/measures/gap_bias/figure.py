@@ -32,7 +32,7 @@ from arcade_torch.tools.measures.gap_bias.measure import (
     AgentRow,
     GapBias,
     gap_and_bias,
-    tasks_out_of_range,
+    range_note,
 )
 from arcade_torch.tools.measures.gap_bias.numbered import name_points, number_points
 from arcade_torch.tools.measures.gap_bias.paper import PAPER_RETURNS, SEEDS, paper_table
@@ -364,12 +364,9 @@ def _table(options: ScoreOptions) -> tuple[Made, GapBias, str]:
         notes.append(table.trouble)
     if table.dropped:
         notes.append(f"left out, some agent lacks one of its twins: {', '.join(table.dropped)}")
-    wide = tasks_out_of_range(scores, table.tasks)
+    wide = range_note(scores, table.tasks)
     if wide:
-        notes.append(
-            f"returns of {', '.join(wide)} lie outside of [0, 1] and count as they are, so gap and "
-            "bias are not of that scale: give a game of yours returns in [0, 1]"
-        )
+        notes.append(wide)
     tasks = f"{len(table.tasks)} task{'s' * (len(table.tasks) > 1)}, {options.metric}"
     note = f"{tasks}, {_seeds([table], options)}"
     return Made(notes=notes, tables=[_printed(table, tasks)]), table, note

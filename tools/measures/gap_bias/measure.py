@@ -71,14 +71,22 @@ def normalise(env_id: str, value: Any) -> Any:
     return (value + 1) / 2 if game_of(env_id) in SIGNED_GAMES else value
 
 
-def tasks_out_of_range(scores: Iterable[Score], tasks: Iterable[str]) -> list[str]:
-    """Those tasks of which a normalised return lies outside of [0, 1]: games of one's own."""
+def range_note(scores: Iterable[Score], tasks: Iterable[str]) -> str:
+    """What to say of those tasks of which a normalised return lies outside of [0, 1], games of
+    one's own; empty where there is none.
+    """
     wide = set[str]()
     for score in scores:
         value = normalise(score.game, score.value)
         if not -_ROUNDING <= value <= 1 + _ROUNDING:
             wide.add(score.game)
-    return [task for task in tasks if task in wide]
+    named = [task for task in tasks if task in wide]
+    if not named:
+        return ""
+    return (
+        f"returns of {', '.join(named)} lie outside of [0, 1] and count as they are, so gap and "
+        "bias are not of that scale: give a game of yours returns in [0, 1]"
+    )
 
 
 @dataclass(frozen=True)
