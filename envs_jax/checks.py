@@ -97,12 +97,12 @@ def _check_keys(game: Game[Any], state: Any) -> None:
     """
     key = jax.random.key(0, impl=KEY_KIND)  # JAX follows keys of this style alone
     calls = {"reset": (key,), "step": (key, state, jax.ShapeDtypeStruct((), jnp.int32))}
-    for method, arguments in calls.items():
+    for method, given in calls.items():
         plain = inspect.unwrap(getattr(type(game), method))  # the wrapper takes the key apart
-        call = compiled(lambda *given, plain=plain: plain(game, *given))
+        call = compiled(lambda *arrays, plain=plain: plain(game, *arrays))
         try:
             with jax.debug_key_reuse(True):
-                call.trace(*arguments)
+                call.trace(*given)
         except jax.errors.KeyReuseError:
             raise ValueError(
                 f"{game.id}: {method} uses a random key twice, so that its draws hang "
@@ -202,9 +202,10 @@ def check_made(game: Any, full_id: str, obs_size: int) -> None:
     """
     if not isinstance(game, Game):
         raise ValueError(f"the factory of {full_id} made {kind_of(game)}, wanted a Game")
-    made = (getattr(game, "id", None), getattr(game, "obs_size", None))
-    if made != (full_id, obs_size):
-        arrived = f"{made[0]!r} with obs_size {made[1]!r}"
+    id = getattr(game, "id", None)
+    size = getattr(game, "obs_size", None)
+    if (id, size) != (full_id, obs_size):
+        arrived = f"{id!r} with obs_size {size!r}"
         raise ValueError(
             f"the factory of {full_id} made {arrived}, wanted {full_id!r} with obs_size "
             f"{obs_size}: pass on both"
