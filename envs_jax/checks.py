@@ -2,6 +2,7 @@
 anything; on request also what random play shows.
 """
 
+import inspect
 from collections.abc import Mapping
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from arcade_torch.envs_jax.game import MEMORY_KINDS, NUM_ACTIONS, ORACLES, Game, keeps_ends
-from arcade_torch.envs_jax.settings import compiled
+from arcade_torch.envs_jax.settings import KEY_KIND, compiled
 from arcade_torch.envs_jax.tracing import check_array, check_same, kind_of_traced, leaves, traced
 from arcade_torch.envs_jax.validation import kind_of
 
@@ -36,10 +37,10 @@ def check_game(game: Game[Any], play: bool = False) -> None:
     Raises:
         ValueError: A function cannot be traced, depends on what Python keeps between calls, or
             gives something of a wrong shape or type; ``step`` changes the structure of the state;
-            or an attribute is missing or of no use. With ``play`` also: a code has no picture, a
-            reward or a state entry is not a number, an episode ends too late or is truncated too
-            early, a return is out of range, or the twins never differ. One line: the game, what
-            arrived, what is wanted.
+            or an attribute is missing or of no use. With ``play`` also: a random key is used for
+            several draws, a code has no picture, a reward or a state entry is not a number, an
+            episode ends too late or is truncated too early, a return is out of range, or the twins
+            never differ. One line: the game, what arrived, what is wanted.
 
     Example:
         >>> from arcade_torch.envs_jax import make
@@ -65,6 +66,7 @@ def check_game(game: Game[Any], play: bool = False) -> None:
     check_array(name, "render gives", frame, (game.obs_size, game.obs_size, 3), "uint8")
     _check_facts(name, traced(name, "facts", game.facts, first))
     if play:
+        _check_keys(game, first)
         _check_play(game)
 
 
@@ -87,6 +89,27 @@ def _check_facts(name: str, facts: Any) -> None:
                 f"{name}: facts gives {fact!r} as {kind}, wanted bool or signed integers for a "
                 "class, or float32 for a number"
             )
+
+
+def _check_keys(game: Game[Any], state: Any) -> None:
+    """Refuse a ``reset`` or ``step`` that uses one random key for several draws, as far as JAX
+    sees it.
+    """
+    key = jax.random.key(0, impl=KEY_KIND)  # JAX follows keys of this style alone
+    calls = {"reset": (key,), "step": (key, state, jax.ShapeDtypeStruct((), jnp.int32))}
+    for method, given in calls.items():
+        plain = inspect.unwrap(getattr(type(game), method))  # the wrapper takes the key apart
+        call = compiled(lambda *arrays, plain=plain: plain(game, *arrays))
+        try:
+            with jax.debug_key_reuse(True):
+                call.trace(*given)
+        except jax.errors.KeyReuseError:
+            raise ValueError(
+                f"{game.id}: {method} uses a random key twice, so that its draws hang "
+                "together: jax.random.split gives a key for each draw"
+            ) from None
+        except Exception:  # it takes keys of the other style alone, and is checked by play
+            continue
 
 
 def _check_play(game: Game[Any]) -> None:
@@ -179,8 +202,10 @@ def check_made(game: Any, full_id: str, obs_size: int) -> None:
     """
     if not isinstance(game, Game):
         raise ValueError(f"the factory of {full_id} made {kind_of(game)}, wanted a Game")
-    if (game.id, game.obs_size) != (full_id, obs_size):
-        arrived = f"{game.id!r} with obs_size {game.obs_size!r}"
+    id = getattr(game, "id", None)
+    size = getattr(game, "obs_size", None)
+    if (id, size) != (full_id, obs_size):
+        arrived = f"{id!r} with obs_size {size!r}"
         raise ValueError(
             f"the factory of {full_id} made {arrived}, wanted {full_id!r} with obs_size "
             f"{obs_size}: pass on both"

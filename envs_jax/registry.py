@@ -231,8 +231,8 @@ def _resolve_one(id: str) -> str:
     hint = f"did you mean {names[near[0]]!r}? Else " if near else ""
     raise ValueError(
         f"unknown env id {format_value(id)}: {hint}arcade_torch.registered_ids() lists all, as "
-        "does 'arcade-torch list'; a game of your own has to be registered first, on the command "
-        "line with --import"
+        "does 'arcade-torch list'; a game of your own has to be registered first in every "
+        "process, on the command line with --import"
     )
 
 

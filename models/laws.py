@@ -74,6 +74,8 @@ def _check_one_shape(s: Subject, batch: int, steps: int) -> None:
     """Types, shapes and dtypes of the outputs of ``batch`` sequences of ``steps`` steps."""
     x = s.random(batch, steps)
     begin = s.initial(batch)
+    if isinstance(begin, TensorDictBase):  # before forward, which may fail by it
+        _check_state(s, batch, f"initial_state({batch})", begin)
     # a copy: what a module keeps of a call in itself is another law's
     module = s.copied().module
     out = module(x, begin, torch.zeros_like(x[..., 0], dtype=torch.bool))
@@ -130,15 +132,8 @@ def _check_original(s: Subject) -> None:
 
 
 def _check_states(s: Subject, batch: int, begin: TensorDict, after: TensorDict) -> None:
-    """Batch size, shapes and dtypes of the first state and of one that forward returned."""
-    for source, state in ((f"initial_state({batch})", begin), ("forward", after)):
-        if list(state.batch_size) != [batch]:
-            raise MemoryLawError(
-                s.law,
-                f"the state of {source} has batch_size {list(state.batch_size)}, not [{batch}]",
-                "TensorDict(..., batch_size=[B]) is missing, or a tensor does not have the batch "
-                "as its first dimension, such as [layers, B, H] of torch.nn.LSTM",
-            )
+    """Refuse a state of forward that is no state, or has another layout than the first one."""
+    _check_state(s, batch, "forward", after)
     expected = _layout(begin)
     returned = _layout(after)
     if expected != returned:
@@ -148,7 +143,18 @@ def _check_states(s: Subject, batch: int, begin: TensorDict, after: TensorDict) 
             "the state grows, lacks the batch dimension, or does not take dtype and device "
             "from the parameters",
         )
-    for path, (_, dtype) in expected.items():
+
+
+def _check_state(s: Subject, batch: int, source: str, state: TensorDict) -> None:
+    """Batch size and dtypes of a state from ``source``."""
+    if list(state.batch_size) != [batch]:
+        raise MemoryLawError(
+            s.law,
+            f"the state of {source} has batch_size {list(state.batch_size)}, not [{batch}]",
+            "TensorDict(..., batch_size=[B]) is missing, or a tensor does not have the batch "
+            "as its first dimension, such as [layers, B, H] of torch.nn.LSTM",
+        )
+    for path, (_, dtype) in _layout(state).items():
         name = ".".join(path)
         if dtype.is_complex:
             raise MemoryLawError(

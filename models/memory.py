@@ -272,6 +272,7 @@ def first_state(memory: nn.Module, batch_size: int | Sequence[int]) -> TensorDic
 
     Raises:
         TypeError: the module is no memory model: it has no such method, or gives no TensorDict.
+        ValueError: a tensor of the state does not begin with the batch.
     """
     name = type(memory).__name__
     if not hasattr(memory, "initial_state"):
@@ -286,6 +287,15 @@ def first_state(memory: nn.Module, batch_size: int | Sequence[int]) -> TensorDic
             f"initial_state of {name} gives no TensorDict, but {type(state).__name__}: "
             'TensorDict({"h": ...}, batch_size=[batch_size])'
         )
+    sizes = batch_shape(batch_size)
+    for path, tensor in state.items(True, True):
+        if list(tensor.shape[: len(sizes)]) != sizes:
+            entry = path if isinstance(path, str) else ".".join(path)
+            wanted = ", ".join([*map(str, sizes), "..."])
+            raise ValueError(
+                f"initial_state({batch_size}) of {name} gives {entry} as {list(tensor.shape)}, "
+                f"expected [{wanted}]: the batch comes first"
+            )
     return state
 
 

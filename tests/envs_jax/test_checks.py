@@ -237,6 +237,27 @@ def test_an_attribute_that_is_missing_is_named():
         check_game(Nameless())
 
 
+def test_a_game_that_forgets_what_it_was_asked_for_is_refused_in_one_line(own_registry):  # noqa: F811
+    class Forgets(Right):
+        obs_size = 256
+
+        def __init__(self, *, id, obs_size, rules):
+            self.rules = rules
+
+    class Bare(Game[State]):
+        reset, step, render = Right.reset, Right.step, Right.render
+
+        def __init__(self, *, id, obs_size, rules):
+            self.rules = rules
+
+    register("ForgetsEasy-v0", Forgets)
+    register("BareEasy-v0", Bare)
+    with pytest.raises(ValueError, match="made 'RightEasy-v0' with obs_size 256, wanted 'Forg"):
+        make("ForgetsEasy")
+    with pytest.raises(ValueError, match="made None with obs_size None, wanted 'BareEasy-v0' wi"):
+        make("BareEasy")
+
+
 UNTRACED = {
     "if state.count > 1: pass": "use jnp.where instead of if",
     "int(state.count)": "use .astype instead of int and float",
@@ -379,6 +400,50 @@ def test_a_state_entry_that_is_no_number_is_named():
     }
     game = type("Wrong", (Right,), methods)()
     with pytest.raises(ValueError, match=r"^WrongEasy-v0: step 1 gives state entry speed as nan$"):
+        check_game(game, play=True)
+
+
+def draw_once(key):
+    return jax.random.bernoulli(key, shape=(3,))
+
+
+def draw_twice(key):
+    return jax.random.bernoulli(key, shape=(3,)) & jax.random.bernoulli(key, shape=(3,))
+
+
+def split_and_draw(key):
+    jax.random.split(key)
+    return jax.random.bernoulli(key, shape=(3,))
+
+
+def fold_in(key):
+    first, second = (jax.random.bernoulli(jax.random.fold_in(key, i), shape=(3,)) for i in (0, 1))
+    return first & second
+
+
+def read_bits(key):
+    return key[0] > jnp.arange(3)
+
+
+@pytest.mark.parametrize("draw", [draw_once, draw_twice, split_and_draw, fold_in, read_bits])
+@pytest.mark.parametrize("method", ["reset", "step"])
+def test_a_random_key_that_is_used_twice_is_refused(draw, method):
+    def reset(self, key):
+        return State(jnp.int32(0), draw(key))
+
+    def step(self, key, state, action):
+        return step_paying(state=lambda s: s._replace(seen=draw(key)))(self, key, state, action)
+
+    game = counter_with(**{method: {"reset": reset, "step": step}[method]})
+    check_game(game)
+    if draw not in (draw_twice, split_and_draw):
+        check_game(game, play=True)
+        return
+    message = (
+        f"WrongEasy-v0: {method} uses a random key twice, so that its draws hang together: "
+        "jax.random.split gives a key for each draw"
+    )
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         check_game(game, play=True)
 
 

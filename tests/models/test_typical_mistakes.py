@@ -566,6 +566,29 @@ def refusal(model: type[Cell]) -> MemoryLawError:
     return caught.value
 
 
+class MultipliesItsState(Cell):
+    """Multiplies the state by a weight, where torch wants equal types."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.recurrent = nn.Linear(WIDTH, WIDTH)
+
+    def fresh(self, begins: Tensor, h: Tensor) -> Tensor:
+        return self.recurrent(super().fresh(begins, h))  # type: ignore[no-any-return]
+
+
+class ZerosWithoutType(MultipliesItsState):
+    def initial_state(self, batch_size: int) -> TensorDict:
+        return TensorDict({"h": torch.zeros(batch_size, WIDTH)}, batch_size=[batch_size])
+
+
+class BatchOfFour(Cell):
+    """Begins with four states, whatever it is asked for."""
+
+    def initial_state(self, batch_size: int) -> TensorDict:
+        return super().initial_state(4)
+
+
 class RollsItsStateInPlace(Cell):
     """Writes into what an earlier step's gradient reads, in a copy of the state it was given."""
 
@@ -624,6 +647,8 @@ def test_passed_before(model: type[Cell], law: str, said: str) -> None:
         (DropoutLeftOn, "equal calls give equal results", "training=self.training"),
         (StateInSelf, "equal calls give equal results", "the module keeps in itself"),
         (Float32State, "shapes are fixed", "h of the state is torch.float32"),
+        (ZerosWithoutType, "shapes are fixed", "take weight.new_zeros(...)"),
+        (BatchOfFour, "shapes are fixed", "initial_state(1) has batch_size [4], not [1]"),
         (NoBatchSize, "shapes are fixed", "has batch_size [], not [1]"),
         (LayersFirst, "shapes are fixed", "such as [layers, B, H]"),
         (WithoutGradient, "nothing leaks over a start", "torch.no_grad"),
@@ -845,3 +870,5 @@ def test_a_module_that_is_no_memory_is_refused_where_it_is_handed_over(use: Any)
         use(nn.LSTM(3, WIDTH))
     with pytest.raises(TypeError, match="TupleState gives no TensorDict, but tuple"):
         use(TupleState())
+    with pytest.raises(ValueError, match=r"BatchOfFour gives h as \[4, 4\], expected \[1, ...\]"):
+        use(BatchOfFour())
