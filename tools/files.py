@@ -26,8 +26,8 @@ from arcade_torch.agents.runs.shipped import is_shipped
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.text import csv_cell, markdown_cell, printable
 
-NARROWEST = 80
-"""Columns of a terminal in which every table can be read."""
+NARROWEST = 40
+"""Columns of a terminal below which a table is wider than it."""
 MOST_ARRAYS = 2 * 2**30
 """Bytes of the largest arrays that are read from a file, unpacked."""
 Row = TypeVar("Row", bound=NamedTuple)

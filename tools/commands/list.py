@@ -98,7 +98,7 @@ class List(Command):
         games = [make(env_id) for env_id in registered_ids()]
         rows = []
         for game in games:
-            returns = "{:g} to {:g}".format(*game.return_range)
+            returns = "{:.3g} to {:.3g}".format(*game.return_range)
             rows.append((game.id, game.max_steps, returns, game.memory_kind or "not said"))
         Table("environments", ("id", "time limit", "return", "the POMDP asks for"), rows).show()
         print(
@@ -118,7 +118,7 @@ class List(Command):
         for name in names:
             kind = type(make_memory(name, 1, 1))
             says = getattr(inspect.getmodule(kind), "__doc__", None) or kind.__doc__ or ""
-            rows.append((name, says.strip().partition("\n")[0]))
+            rows.append((name, " ".join(says.strip().partition("\n\n")[0].split())))
         Table("memory models", ("name", "what it is"), rows, left=2).show()
         columns = ["name", "parameters", "state", "state in bytes", "multiply-adds"]
         columns += ["acting us", "learning us", "to the LRU's"] if self.measure else []
