@@ -161,6 +161,19 @@ def legend_name(name: str) -> str:
     return f"\u200b{name}" if name.startswith("_") else name
 
 
+def folded(name: str, letters: int = 22) -> str:
+    """A name beside an axis in lines of so many letters at most, cut behind a separator if it has
+    one there.
+
+    Example:
+        >>> folded("a_memory_whose_name_is_long", 16)
+        'a_memory_whose_\nname_is_long'
+    """
+    most = f"{{1,{letters}}}"
+    parts = rf".{most}$|.{{1,{letters - 1}}}[-_. ]|.{most}"
+    return "\n".join(re.findall(parts, name))
+
+
 def plain_legend(axis: Any) -> None:
     """The legend of a panel, its names as they are written: no mathematics between dollars."""
     for text in axis.legend(fontsize="small").get_texts():

@@ -261,7 +261,7 @@ def plot_bars(scores: Mapping[str, OfAgent], axis: Any, colours: Mapping[str, st
     """Draw the scores over all steps: full bars of states, empty bars of frames."""
     for x, width, agent, source, score in _bars(scores):
         height = max(score.value, LOWEST)
-        axis.bar(x, height, width, lw=1, **_look(source, colours[agent]))
+        axis.bar(x, height, 0.88 * width, lw=1, **_look(source, colours[agent]))
         ends = style.whiskers(
             np.array([score.value]), np.array([score.low]), np.array([score.high])
         )
@@ -376,7 +376,7 @@ def beliefs_section(
             for label in axis.get_xticklabels():
                 label.set(rotation=20, ha="right", rotation_mode="anchor")
 
-    parts = section("beliefs", hiding, OF_RUN, summary, draw, progress)
+    parts = section("beliefs", hiding, OF_RUN, summary, draw, "score", progress)
     parts["notes"] = [note for note in parts["notes"] if NO_FACTS not in note]
     parts["sentences"] = _sentences(parts["rows"])
     return parts

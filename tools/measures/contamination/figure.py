@@ -350,7 +350,8 @@ def contamination_section(
         from_zero(axis)
         axis.set_xlabel("steps after the noisy frame")
 
-    parts = section("contamination", cells, OF_RUN, _section_row, draw, progress)
+    share = "decisions changed"
+    parts = section("contamination", cells, OF_RUN, _section_row, draw, share, progress)
     short = dict[str, int]()
     for row in parts["rows"]:
         task = f"{row['game']} {row['twin']}"

@@ -278,7 +278,8 @@ def counterfactual_section(
             axis.plot(np.arange(len(share)), share, color=colours[agent], ls="--", lw=1)
         axis.set_xlabel("steps back from the decision")
 
-    parts = section("counterfactual recall", cells, OF_RUN, summary, draw, progress)
+    share = "decisions changed"
+    parts = section("counterfactual recall", cells, OF_RUN, summary, draw, share, progress)
     parts["sentences"] = _sentences(parts["rows"])
     return parts
 
