@@ -299,6 +299,7 @@ def plot_steps(
                 ends = (of_fact.low, of_fact.high)
                 axis.fill_between(steps, *ends, color=colours[agent], alpha=0.15, lw=0)
     axis.axhline(0, color=style.NEUTRAL, lw=0.8)
+    axis.xaxis.get_major_locator().set_params(integer=True)
     axis.set_xlabel("step of the episode")
     axis.set_title(fact)
 

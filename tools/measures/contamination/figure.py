@@ -260,7 +260,7 @@ def contamination_figure(
         axis.set_xlabel("steps to the decision")
     axes[0].set_ylabel(MEASURES[name])
     from_zero(axes[0])
-    style.plain_legend(axes[0])
+    style.legend_above(figure, axes[0].get_legend_handles_labels()[0])
     return figure
 
 

@@ -237,7 +237,7 @@ def counterfactual_figure(
         axis.set_title(title)
         axis.set_xlabel("steps back from the decision")
     axes[0].set_ylabel(EFFECTS[effect])
-    style.plain_legend(axes[0])
+    style.legend_above(figure, axes[0].get_legend_handles_labels()[0])
     return figure
 
 

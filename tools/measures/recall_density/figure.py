@@ -54,8 +54,8 @@ def densities(options: DensityOptions, progress: Progress | None) -> Made:
         else:
             figure, seeds = _curves(measured, masses, bins, options.confidence)
         note = (
-            f"{seeds} x {counts} greedy trajectories (mean length {frames.mean():.0f} frames); "
-            f"decision: {end}"
+            f"{seeds}; {counts} greedy trajectories a run, "
+            f"{frames.mean():.0f} frames long on average; decision: {end}"
         )
         if bins <= BARS_UP_TO:
             note += "; dotted: uniform memory; without memory: all in the most recent part"
@@ -304,7 +304,7 @@ def recall_density_figure(
     plot(series, axis, bins, lengths)
     axis.set_xlabel("time in the trajectory (1: the decision)")
     axis.set_ylabel(f"share of the gradient in 1/{bins}")
-    style.plain_legend(axis)
+    style.legend_above(figure, axis.get_legend_handles_labels()[0])
     return figure
 
 
