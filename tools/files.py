@@ -54,6 +54,8 @@ class Table:
         console = need("rich.console").Console
         terminal = sys.stdout.isatty() or "COLUMNS" in os.environ
         width = max(console().width if terminal else sum(widths) + 1, NARROWEST)
+        if sum(widths) + 1 > width:  # a long name goes on in the next line
+            widths[0] = min(widths[0], width // 2)
         parts = self._parts(widths, width)
         for part in parts:
             title = _lines(self.title) if part is parts[0] else ""
@@ -63,7 +65,8 @@ class Table:
             table.caption_justify = "left"
             for column in part:
                 side = "left" if column < self.left else "right"
-                table.add_column(lines[0][column], justify=side, overflow="fold")
+                most = widths[0] - 3 if column == 0 else None
+                table.add_column(lines[0][column], justify=side, overflow="fold", max_width=most)
             for line in lines[1:]:
                 table.add_row(*(line[column] for column in part))
             console(highlight=False, markup=False, emoji=False, width=width).print(table)

@@ -77,7 +77,11 @@ def test_a_table_is_no_wider_than_the_terminal(
     says = "a memory whose rows forget at rates of their own, with a delta rule, in every channel"
     Table("", ("name", "what it is"), [("rwkv7", says)], left=2).show()
     Table("", ("name", *[f"number {i}" for i in range(9)]), [("rwkv7", *range(9))]).show()
+    numbers = [f"n{i}" for i in range(9)]
+    Table("", ("name", *numbers), [("x" * 40, *range(9))]).show()
     out = capsys.readouterr().out
+    assert out.count("┏") == {40: 9, 60: 6, 80: 5, 200: 3}[columns]
+    assert columns < 200 or "x" * 40 in out
     assert max(map(len, out.splitlines())) <= columns
     assert all(word in out for word in (*says.split(), *[f"number {i}" for i in range(9)]))
 

@@ -305,14 +305,15 @@ def plot_steps(
 
 
 def _legend(scores: Mapping[str, OfAgent], colours: Mapping[str, str]) -> list[Any]:
-    """Handles with labels: a colour an agent, and what full and empty bars are."""
+    """Handles with labels: a colour an agent, and what full and empty bars, and lines, are."""
     from matplotlib.patches import Patch
 
     handles = list[Any]()
     for agent in scores:
         handles.append(Patch(facecolor=colours[agent], label=style.legend_name(agent)))
     for source, name in SOURCES.items():
-        handles.append(Patch(**_look(source, style.NEUTRAL), label=name))
+        lines = "full" if source == "state" else "broken"
+        handles.append(Patch(**_look(source, style.NEUTRAL), label=f"{name} ({lines} lines)"))
     return handles
 
 
