@@ -166,8 +166,9 @@ def folded(name: str, letters: int = 22) -> str:
     one there.
 
     Example:
-        >>> folded("a_memory_whose_name_is_long", 16)
-        'a_memory_whose_\nname_is_long'
+        >>> print(folded("a_memory_whose_name_is_long", 16))
+        a_memory_whose_
+        name_is_long
     """
     most = f"{{1,{letters}}}"
     parts = rf".{most}$|.{{1,{letters - 1}}}[-_. ]|.{most}"
