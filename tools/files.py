@@ -25,8 +25,8 @@ from arcade_torch.agents.runs.shipped import is_shipped
 from arcade_torch.tools.errors import need
 from arcade_torch.tools.text import csv_cell, markdown_cell, printable
 
-NARROWEST = 80
-"""Columns of a terminal in which every table can be read."""
+NARROWEST = 40
+"""Columns of a terminal below which a table is wider than it."""
 MOST_ARRAYS = 2 * 2**30
 """Bytes of the largest arrays that are read from a file, unpacked."""
 Row = TypeVar("Row", bound=NamedTuple)
@@ -53,6 +53,8 @@ class Table:
         console = need("rich.console").Console
         terminal = sys.stdout.isatty() or "COLUMNS" in os.environ
         width = max(console().width if terminal else sum(widths) + 1, NARROWEST)
+        if sum(widths) + 1 > width:  # a long name goes on in the next line
+            widths[0] = min(widths[0], width // 2)
         parts = self._parts(widths, width)
         for part in parts:
             title = _lines(self.title) if part is parts[0] else ""
@@ -62,7 +64,8 @@ class Table:
             table.caption_justify = "left"
             for column in part:
                 side = "left" if column < self.left else "right"
-                table.add_column(lines[0][column], justify=side, overflow="fold")
+                most = widths[0] - 3 if column == 0 else None
+                table.add_column(lines[0][column], justify=side, overflow="fold", max_width=most)
             for line in lines[1:]:
                 table.add_row(*(line[column] for column in part))
             console(highlight=False, markup=False, emoji=False, width=width).print(table)

@@ -40,11 +40,16 @@ class Bars:
         self.terminal = self.stream.isatty()
         rich = need("rich.progress")
         console = need("rich.console").Console(file=self.stream)
+        column = need("rich.table").Column
+        # only the words go on in further lines where a terminal is narrow: they stand last
         columns = [
-            rich.TextColumn("{task.description}", markup=False),
-            rich.BarColumn(bar_width=24),
-            rich.TaskProgressColumn(),
-            rich.TextColumn("{task.fields[text]}", markup=False),
+            rich.BarColumn(bar_width=16, table_column=column(no_wrap=True)),
+            rich.TaskProgressColumn(table_column=column(no_wrap=True)),
+            rich.TextColumn(
+                "{task.description}{task.fields[text]}",
+                markup=False,
+                table_column=column(overflow="fold"),
+            ),
         ]
         self._bars = rich.Progress(
             *columns, console=console, refresh_per_second=4, speed_estimate_period=WINDOW_S
@@ -82,7 +87,7 @@ class Bars:
         if text:
             words.append(text)
         said = printable(", ".join(words))
-        task.fields["text"] = said
+        task.fields["text"] = f": {said}" if said else ""
         self._line = f"{name}: {done:,}" if total or self.unit or not said else f"{name}: {said}"
         if total:
             self._line += f" of {total:,}"

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.text import Text
 
 from arcade_torch.agents.runs.files import read_csv
 from arcade_torch.tools import cli, saliency_figure
@@ -20,8 +21,10 @@ from arcade_torch.tools.figures.catalogue import FIGURES
 from arcade_torch.tools.figures.fonts import save_figure
 from arcade_torch.tools.figures.style import drawing, legend_above, new_figure, svg
 from arcade_torch.tools.measures.gap_bias import ScoreOptions
-from arcade_torch.tools.measures.gap_bias.figure import gap_bias, returns
+from arcade_torch.tools.measures.gap_bias.figure import gap_bias, returns, score_panels
+from arcade_torch.tools.measures.gap_bias.measure import gap_and_bias
 from arcade_torch.tools.names import printable
+from arcade_torch.tools.scores import read_scores
 from tests.tools.test_runs import write
 
 HOSTILE = [
@@ -286,3 +289,37 @@ def test_a_picture_that_is_drawn_again_leaves_nothing_of_the_first(
     file = BytesIO()
     save_figure(new_figure(), file)
     assert file.getvalue() == b"with letters"
+
+
+@pytest.mark.parametrize("count", [1, 6, 20])
+@pytest.mark.parametrize("name", ["a_memory_whose_name_has_all_forty_letter", "x" * 60])
+def test_bars_of_a_report_have_room_beside_long_names(
+    count: int, name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before: a name of 40 letters left a strip of the panel, and its label was cut."""
+    agents = [f"{place}{name}"[: len(name)] for place in range(count)]
+    scores = read_scores([scores_of(tmp_path, agents)], "eval_final")
+    monkeypatch.setattr("arcade_torch.tools.figures.style.svg", lambda figure, _: figure)
+    with drawing("light"):
+        for figure in score_panels(gap_and_bias(scores, draws=10)):
+            figure.draw_without_rendering()
+            (axis,) = figure.axes
+            ticks = [*axis.get_xticklabels(), *axis.get_yticklabels()]
+            names = [tick for tick in ticks if not tick.get_text()[-1].isdigit()]
+            assert len(names) == count + 1
+            around = (axis.title, axis.xaxis.label, axis.yaxis.label)
+            for text in (*names, *filter(Text.get_text, around)):
+                box = text.get_window_extent()
+                assert box.x0 >= 0 and box.x1 <= figure.bbox.x1, text.get_text()
+                assert box.y0 >= 0 and box.y1 <= figure.bbox.y1, text.get_text()
+            room = axis.get_window_extent()
+            assert room.width > figure.bbox.width / 3 and room.height > figure.bbox.height / 3
+            assert not overlapping([text.get_window_extent() for text in names])
+
+
+def test_a_bar_of_zero_is_seen(tmp_path: Path) -> None:
+    """Before: agents that earn nothing left an empty panel."""
+    options = ScoreOptions(runs=(scores_of(tmp_path, ["lru"]),), draws=10)
+    with drawing("light"):
+        for axis in returns(options, None).pictures[0].figure.axes:
+            assert all(bar.get_edgecolor() == bar.get_facecolor() for bar in axis.patches)

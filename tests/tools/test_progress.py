@@ -4,6 +4,7 @@ import time
 from io import StringIO
 
 import pytest
+from rich.text import Text
 
 from arcade_torch.tools.progress import Bars, describe_row
 
@@ -59,3 +60,25 @@ def test_a_policy_that_is_sampled_shows_its_entropy_and_the_greedy_return_appear
     )
     assert "greedy -0.125, loss 0.0123, entropy 1.50, lr" in describe_row(row)
     assert describe_row({"frames": 1, "total_frames": 2, "lr": 1e-3}) == "lr 1.0e-03"
+
+
+class Screen(StringIO):
+    """A stream that says it is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("columns", [60, 80, 200])
+@pytest.mark.parametrize("name", ["runs/one", "runs/SignpostEasy__partial__gru__pqn__seed0"])
+def test_a_terminal_shows_how_far_a_run_is_and_all_that_is_said_of_it(
+    name: str, columns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    monkeypatch.setenv("TERM", "xterm")
+    with Bars(stream := Screen(), "frames") as bars:
+        bars.update(name, 4_000, 16_000, describe_row(ROW))
+        bars._bars.refresh()
+    shown = Text.from_ansi(stream.getvalue()).plain
+    assert " 25%" in shown and "━" in shown and "…" not in shown.replace(name[:4], "")
+    assert all(word in shown for word in describe_row(ROW).split())

@@ -69,6 +69,23 @@ def test_markup_is_shown_and_not_carried_out(text: str, capsys: pytest.CaptureFi
     assert stream.getvalue().count(text) == 3
 
 
+@pytest.mark.parametrize("columns", [40, 60, 80, 200])
+def test_a_table_is_no_wider_than_the_terminal(
+    columns: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    says = "a memory whose rows forget at rates of their own, with a delta rule, in every channel"
+    Table("", ("name", "what it is"), [("rwkv7", says)], left=2).show()
+    Table("", ("name", *[f"number {i}" for i in range(9)]), [("rwkv7", *range(9))]).show()
+    numbers = [f"n{i}" for i in range(9)]
+    Table("", ("name", *numbers), [("x" * 40, *range(9))]).show()
+    out = capsys.readouterr().out
+    assert out.count("┏") == {40: 9, 60: 6, 80: 5, 200: 3}[columns]
+    assert columns < 200 or "x" * 40 in out
+    assert max(map(len, out.splitlines())) <= columns
+    assert all(word in out for word in (*says.split(), *[f"number {i}" for i in range(9)]))
+
+
 @pytest.mark.parametrize(
     "text", ["=1+1", "+x", "-x", "@SUM(A1)", '=HYPERLINK("x")', "\t=1", "\r=1", "--", "+"]
 )

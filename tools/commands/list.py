@@ -105,7 +105,7 @@ class List(Command):
         games = [make(env_id) for env_id in registered_ids()]
         rows = []
         for game in games:
-            returns = "{:g} to {:g}".format(*game.return_range)
+            returns = "{:.3g} to {:.3g}".format(*game.return_range)
             rows.append((game.id, game.max_steps, returns, game.memory_kind or "not said"))
         Table("environments", ("id", "time limit", "return", "the POMDP asks for"), rows).show()
         print(
@@ -124,7 +124,7 @@ class List(Command):
         for name in names:
             kind = type(make_memory(name, 1, 1))
             says = getattr(inspect.getmodule(kind), "__doc__", None) or kind.__doc__ or ""
-            rows.append((name, says.strip().partition("\n")[0]))
+            rows.append((name, " ".join(says.strip().partition("\n\n")[0].split())))
         Table("memory models", ("name", "what it is"), rows, left=2).show()
         self._costs("the paper's network", names, PAPER_SIZE)
         self._costs("the small network", names, PRESETS["small"].hidden_size)

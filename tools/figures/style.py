@@ -161,10 +161,18 @@ def legend_name(name: str) -> str:
     return f"\u200b{name}" if name.startswith("_") else name
 
 
-def plain_legend(axis: Any) -> None:
-    """The legend of a panel, its names as they are written: no mathematics between dollars."""
-    for text in axis.legend(fontsize="small").get_texts():
-        text.set_parse_math(False)
+def folded(name: str, letters: int = 22) -> str:
+    """A name beside an axis in lines of so many letters at most, cut behind a separator if it has
+    one there.
+
+    Example:
+        >>> print(folded("a_memory_whose_name_is_long", 16))
+        a_memory_whose_
+        name_is_long
+    """
+    most = f"{{1,{letters}}}"
+    parts = rf".{most}$|.{{1,{letters - 1}}}[-_. ]|.{most}"
+    return "\n".join(re.findall(parts, name))
 
 
 def agent_markers(agents: Iterable[str], colours: Mapping[str, str]) -> dict[str, str]:
@@ -190,9 +198,11 @@ def legend_above(
     title: str = "",
 ) -> None:
     """Put a legend above the panels, in as many columns as its names and a title at the left leave
-    room for; the figure grows with its lines.
+    room for; the figure grows with its lines. Names are text: no mathematics between dollars.
     """
     legend = figure.legend(handles=handles, loc=loc, ncols=1)
+    for text in legend.get_texts():
+        text.set_parse_math(False)
     size = legend.prop.get_size_in_points()
     texts = list(legend.get_texts())
     if title:
@@ -207,7 +217,8 @@ def legend_above(
     lines = math.ceil(len(handles) / columns)
     figure.set_figheight(figure.get_figheight() + 1.6 * size / 72 * max(0, lines - 2))
     legend.remove()
-    figure.legend(handles=handles, loc=loc, ncols=columns)
+    for text in figure.legend(handles=handles, loc=loc, ncols=columns).get_texts():
+        text.set_parse_math(False)
 
 
 def agent_colours(names: Sequence[str]) -> dict[str, str]:

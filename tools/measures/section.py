@@ -18,6 +18,7 @@ def section(
     measure: tuple[Callable[..., Any], Mapping[str, Any]],
     summary: Callable[[Any], tuple[Any, dict[str, Any]]],
     plot: Callable[[Any, Any], None],
+    ylabel: str,
     progress: Progress | None,
 ) -> dict[str, Any]:
     """Measure every cell for a row of the table, and draw the agents of each task in one picture;
@@ -41,6 +42,6 @@ def section(
         axis = axes[0, 0]
         plot(by_agent, axis)
         title = f"{game}, {style.TWIN_NAMES[twin]}"
-        axis.set_title(title)
+        axis.set(title=title, ylabel=ylabel)
         pictures.append(style.svg(figure, f"{name} {title}"))
     return {"pictures": pictures, "rows": rows, "notes": notes}

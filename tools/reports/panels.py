@@ -123,6 +123,7 @@ def curve_panels(
         axis = axes[0, 0]
         logs.plot(by_agent, axis, agents, _named_levels(means, twin, 2 * margin))
         axis.set(ylim=(low - margin, high + margin), title=f"{game}, {TWIN_NAMES[twin]}")
+        axis.set_ylabel("greedy return" if kind == "eval" else "training return")
         picture = style.svg(figure, f"{kind} {game}, {TWIN_NAMES[twin]}")
         caption = "" if small else _curve_caption(list(by_agent.values()))
         panels.append({"picture": picture, "caption": caption, "task": f"{game}-{twin}"})

@@ -1,7 +1,8 @@
 """Figures of measures of any policy: frames of any kind, any number of actions, one seed or some."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -144,7 +145,7 @@ def test_names_with_dollars_are_text_in_figures_of_ones_own() -> None:
         recall_density_figure(dict.fromkeys(DOLLARS, density)),
     ):
         figure.canvas.draw()
-        texts = figure.axes[0].get_legend().get_texts()
+        texts = figure.legends[0].get_texts()
         assert [text.get_text().lstrip("\u200b") for text in texts][: len(DOLLARS)] == DOLLARS
         assert not any(text.get_parse_math() for text in texts)
     example = contamination_example(policy_of(), Foreign(), horizon=6, **NAMES)
@@ -152,6 +153,80 @@ def test_names_with_dollars_are_text_in_figures_of_ones_own() -> None:
     figure.canvas.draw()
     ticks = figure.axes[-1].get_xticklabels()
     assert [tick.get_text() for tick in ticks] == DOLLARS[:ACTIONS]
+
+
+def assert_inside(figure: Any, texts: Iterable[Any]) -> None:
+    """Nothing is cut, and nothing is written over another text."""
+    figure.canvas.draw()
+    boxes = [text.get_window_extent() for text in texts if text.get_text()]
+    for box in boxes:
+        assert box.x0 >= 0 and box.x1 <= figure.bbox.x1 and box.y0 >= 0 and box.y1 <= figure.bbox.y1
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+
+
+LONG = "a_memory_whose_name_has_all_forty_letter"
+
+
+def test_legends_stand_beside_what_is_drawn() -> None:
+    """Before: names lay over the lines, and long ones over the numbers of the axis."""
+    changes = contamination(policy_of(), Foreign(), sigmas=(1.0,), delays=(0, 1), starts=4, **NAMES)
+    exchanges = counterfactual(policy_of(), Foreign(), episodes=4, donors=1, **NAMES)
+    density = recall_density(policy_of(), Foreign(), episodes=2, **NAMES)
+    names = [LONG, "gru", "mlp"]
+    for figure in (
+        contamination_figure(dict.fromkeys(names, changes)),
+        counterfactual_figure(dict.fromkeys(names, exchanges)),
+        recall_density_figure(dict.fromkeys(names, density)),
+    ):
+        (legend,) = figure.legends
+        assert_inside(figure, legend.get_texts())
+        for axis in figure.axes:
+            assert axis.get_legend() is None
+            assert not legend.get_window_extent().overlaps(axis.get_window_extent())
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        [f"move the arm forward and {place}" for place in range(ACTIONS)],
+        [str(place) for place in range(18)],
+        ["NOOP", "DOWNRIGHTFIRE", "UPLEFTFIRE"] * 6,
+        [LONG] * 4,
+    ],
+)
+def test_many_actions_and_long_names_of_them_can_be_read(names: list[str]) -> None:
+    """Before: they were written over each other."""
+    example = contamination_example(policy_of(), Foreign(), horizon=6, **NAMES)
+    values = np.linspace(-1, 1, len(names) * len(example.values), dtype=np.float32)
+    example = replace(example, values=values.reshape(-1, len(names)))
+    figure = contamination_example_figure(example, actions=names)
+    bars = figure.axes[3::4]
+    figure.canvas.draw()
+    assert_inside(figure, bars[-1].get_xticklabels())
+    heights = [axis.get_window_extent().height for axis in bars]
+    assert min(heights) > 0.9 * max(heights) > 60
+
+
+def test_the_title_of_a_strip_is_not_cut() -> None:
+    frames = np.zeros((5, 4, 4, 3), np.uint8)
+    maps = np.ones((5, 4, 4), np.float32)
+    for title in (LONG, f"{LONG} on a game, seed 0", "x"):
+        for show in (1, 2, 5):
+            figure = saliency_figure([(title, frames, maps), ("b", frames, maps)], show=show)
+            assert_inside(figure, [part._suptitle for part in figure.subfigs])
+            assert title.replace(" ", "") in figure.subfigs[0]._suptitle.get_text().translate(BLANK)
+
+
+BLANK = str.maketrans("", "", " \n")
+
+
+def test_steps_of_an_episode_are_whole_numbers() -> None:
+    """Before: the axis of beliefs had steps 0.5 and 1.5."""
+    env = make("MineSweeperEasy", num_envs=8, observability="partial", seed=0)
+    probes = beliefs(make_network("small", "gru"), env, episodes=16, max_steps=4)
+    figure = beliefs_figure({"gru": probes, **dict.fromkeys(DOLLARS, probes)})
+    figure.canvas.draw()
+    assert all(float(tick).is_integer() for tick in figure.axes[1].get_xticks())
 
 
 def test_actions_of_one_name_have_a_bar_each_and_all_have_a_name() -> None:

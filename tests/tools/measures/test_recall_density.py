@@ -12,6 +12,9 @@ from hypothesis import strategies as st
 from arcade_torch.agents import Agent, preset
 from arcade_torch.agents.policy import build_network
 from arcade_torch.tools import Policy, recall_density, saliency
+from arcade_torch.tools.figures import style
+from arcade_torch.tools.measures.bootstrap import pooled
+from arcade_torch.tools.measures.recall_density import figure as recall_density_figures
 from arcade_torch.tools.measures.recall_density.measure import (
     binned,
     density_of_windows,
@@ -166,3 +169,23 @@ def test_bad_options_are_refused(options: dict[str, Any], message: str) -> None:
         recall_density(object(), ToyEnv([5]))
     with pytest.raises(RuntimeError, match="does not exist"):
         recall_density(Path("no/such/run"))
+
+
+def test_equal_lines_are_all_seen_and_an_agent_looks_alike_in_every_panel() -> None:
+    """Before: an agent's broken line lay under another's full one, and was full where one was
+    missing.
+    """
+    agents = ["gru", "lru", "mlp"]
+    colours = style.agent_colours(agents)
+    equal = pooled([[0.25, 0.75]])
+    with style.drawing("light") as plt:
+        axes = plt.subplots(1, 2)[1]
+        for axis, drawn in zip(axes, (agents, agents[1:]), strict=True):
+            series = {agent: (equal, colours[agent]) for agent in drawn}
+            recall_density_figures.plot(series, axis, 2, names=agents)
+        lines = [{line.get_label(): line for line in axis.patches} for axis in axes]
+    upwards = sorted(agents, key=lambda agent: lines[0][agent].get_zorder())
+    assert [lines[0][agent].get_linestyle() == "-" for agent in upwards] == [True, False, False]
+    for agent in agents[1:]:
+        assert lines[0][agent].get_linestyle() == lines[1][agent].get_linestyle()
+    assert len({lines[0][agent].get_linestyle() for agent in agents}) == 3

@@ -261,7 +261,7 @@ def plot_bars(scores: Mapping[str, OfAgent], axis: Any, colours: Mapping[str, st
     """Draw the scores over all steps: full bars of states, empty bars of frames."""
     for x, width, agent, source, score in _bars(scores):
         height = max(score.value, LOWEST)
-        axis.bar(x, height, width, lw=1, **_look(source, colours[agent]))
+        axis.bar(x, height, 0.88 * width, lw=1, **_look(source, colours[agent]))
         ends = style.whiskers(
             np.array([score.value]), np.array([score.low]), np.array([score.high])
         )
@@ -299,19 +299,21 @@ def plot_steps(
                 ends = (of_fact.low, of_fact.high)
                 axis.fill_between(steps, *ends, color=colours[agent], alpha=0.15, lw=0)
     axis.axhline(0, color=style.NEUTRAL, lw=0.8)
+    axis.xaxis.get_major_locator().set_params(integer=True)
     axis.set_xlabel("step of the episode")
     axis.set_title(fact)
 
 
 def _legend(scores: Mapping[str, OfAgent], colours: Mapping[str, str]) -> list[Any]:
-    """Handles with labels: a colour an agent, and what full and empty bars are."""
+    """Handles with labels: a colour an agent, and what full and empty bars, and lines, are."""
     from matplotlib.patches import Patch
 
     handles = list[Any]()
     for agent in scores:
         handles.append(Patch(facecolor=colours[agent], label=style.legend_name(agent)))
     for source, name in SOURCES.items():
-        handles.append(Patch(**_look(source, style.NEUTRAL), label=name))
+        lines = "full" if source == "state" else "broken"
+        handles.append(Patch(**_look(source, style.NEUTRAL), label=f"{name} ({lines} lines)"))
     return handles
 
 
@@ -376,7 +378,7 @@ def beliefs_section(
             for label in axis.get_xticklabels():
                 label.set(rotation=20, ha="right", rotation_mode="anchor")
 
-    parts = section("beliefs", hiding, OF_RUN, summary, draw, progress)
+    parts = section("beliefs", hiding, OF_RUN, summary, draw, "score", progress)
     parts["notes"] = [note for note in parts["notes"] if NO_FACTS not in note]
     parts["sentences"] = _sentences(parts["rows"])
     return parts

@@ -18,6 +18,10 @@ from arcade_torch.tools.measures.contamination import measure
 CLEAN_BEST = "#354e6a"
 OTHER_BEST = "#a33a2f"
 REST = "#b3b3b3"
+MOST_LETTERS = 34
+"""Of actions beside one another below their bars; more stand upright, below the last row alone."""
+LETTER = 0.075
+"""Inches of a letter that stands upright."""
 
 
 def contamination_example_figure(
@@ -50,7 +54,10 @@ def contamination_example_figure(
     count = example.values.shape[1]
     require(len(names_of_actions) == count, "actions", names_of_actions, f"{count} names")
     columns = 6 if shuffle else 3
-    figure.set_size_inches(1.6 * (columns + 1.7), 1.7 * len(names) + 0.8)
+    labels = [style.folded(name) for name in names_of_actions]
+    is_crowded = sum(len(name) + 2 for name in names_of_actions) > MOST_LETTERS
+    turned = max(map(len, "\n".join(labels).split("\n"))) * LETTER if is_crowded else 0.0
+    figure.set_size_inches(1.6 * (columns + 1.7), 1.7 * len(names) + 0.8 + turned)
     figure.set_layout_engine("constrained")
     widths = [1.0] * columns + [1.7]
     axes = figure.subplots(
@@ -68,7 +75,10 @@ def contamination_example_figure(
             axis.set(xticks=[], yticks=[], frame_on=False)
             axis.set_title(f"$o_{{{example.order[row, t]}}}$", parse_math=True)
         pictures[0].set_ylabel(names[row], fontsize="small")
-        _plot_outputs(example, row, bars, names_of_actions)
+        _plot_outputs(example, row, bars)
+        is_last = row == len(names) - 1
+        bars.set_xticks(range(count), labels, rotation=90 if is_crowded else 0, parse_math=False)
+        bars.tick_params(labelsize="small", labelbottom=is_last or not is_crowded)
     outputs = "probabilities" if example.target == "probs" else f"centred {example.target}"
     axes[0, -1].set_title(f"{outputs} on $o_{{{n}}}$", parse_math=True)
     figure.suptitle(title, x=0.01, ha="left", parse_math=False)
@@ -89,12 +99,10 @@ def action_names(example: measure.Example) -> list[str]:
     return names if count == len(names) else [str(action) for action in range(count)]
 
 
-def _plot_outputs(example: measure.Example, row: int, axis: Any, actions: Sequence[str]) -> None:
+def _plot_outputs(example: measure.Example, row: int, axis: Any) -> None:
     """Draw the outputs of a row as bars, that of the best action in colour."""
     best = np.nanargmax(example.values, axis=1)
-    axis.bar(range(len(actions)), example.values[row], color=REST)
-    axis.set_xticks(range(len(actions)), actions, parse_math=False)
+    axis.bar(range(example.values.shape[1]), example.values[row], color=REST)
     axis.patches[best[row]].set_facecolor(OTHER_BEST)
     axis.patches[best[0]].set_facecolor(CLEAN_BEST)
     axis.axhline(0.0, color=style.NEUTRAL, lw=0.8)
-    axis.tick_params(labelsize="small")

@@ -260,7 +260,7 @@ def contamination_figure(
         axis.set_xlabel("steps to the decision")
     axes[0].set_ylabel(MEASURES[name])
     from_zero(axes[0])
-    style.plain_legend(axes[0])
+    style.legend_above(figure, axes[0].get_legend_handles_labels()[0])
     return figure
 
 
@@ -350,7 +350,8 @@ def contamination_section(
         from_zero(axis)
         axis.set_xlabel("steps after the noisy frame")
 
-    parts = section("contamination", cells, OF_RUN, _section_row, draw, progress)
+    share = "decisions changed"
+    parts = section("contamination", cells, OF_RUN, _section_row, draw, share, progress)
     short = dict[str, int]()
     for row in parts["rows"]:
         task = f"{row['game']} {row['twin']}"

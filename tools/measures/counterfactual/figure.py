@@ -242,7 +242,7 @@ def counterfactual_figure(
         axis.set_title(title)
         axis.set_xlabel("steps back from the decision")
     axes[0].set_ylabel(EFFECTS[effect])
-    style.plain_legend(axes[0])
+    style.legend_above(figure, axes[0].get_legend_handles_labels()[0])
     return figure
 
 
@@ -283,7 +283,8 @@ def counterfactual_section(
             axis.plot(np.arange(len(share)), share, color=colours[agent], ls="--", lw=1)
         axis.set_xlabel("steps back from the decision")
 
-    parts = section("counterfactual recall", cells, OF_RUN, summary, draw, progress)
+    share = "decisions changed"
+    parts = section("counterfactual recall", cells, OF_RUN, summary, draw, share, progress)
     parts["sentences"] = _sentences(parts["rows"])
     return parts
 

@@ -233,19 +233,13 @@ def _widen(axis: Any) -> None:
 
 def plot_bars(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
     """Draw one number of every agent, one of `PANELS`, as a bar with its interval."""
-    agents, intervals, colours = _numbers(rows, name)
+    agents, intervals, look = _numbers(rows, name)
     places = range(len(agents))
-    axis.bar(
-        places,
-        [interval.value for interval in intervals],
-        0.72,
-        color=colours,
-        yerr=_whiskers(intervals),
-        error_kw={"lw": 1},
-        capsize=3,
-    )
+    values = [interval.value for interval in intervals]
+    axis.bar(places, values, 0.72, yerr=_whiskers(intervals), capsize=3, **look)
     turn = 35 if len(agents) <= MOST_BESIDE else 60
-    axis.set_xticks(places, agents, rotation=turn, ha="right", rotation_mode="anchor")
+    labels = list(map(style.folded, agents))
+    axis.set_xticks(places, labels, rotation=turn, ha="right", rotation_mode="anchor")
     axis.set(title=PANELS[name][0], ylabel=PANELS[name][1])
     if name in ("gap", "bias"):
         axis.axhline(0.0, color=NEUTRAL, lw=1, ls="--")
@@ -253,29 +247,28 @@ def plot_bars(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
 
 def plot_lines(rows: Sequence[AgentRow], axis: Any, name: str) -> None:
     """The same of many agents in a narrow panel: a line each, with its interval."""
-    agents, intervals, colours = _numbers(rows, name)
+    agents, intervals, look = _numbers(rows, name)
     places = range(len(agents))
-    axis.barh(
-        places,
-        [interval.value for interval in intervals],
-        0.72,
-        color=colours,
-        xerr=_whiskers(intervals),
-        error_kw={"lw": 1},
-    )
-    axis.set_yticks(places, agents, fontsize=8)
+    values = [interval.value for interval in intervals]
+    axis.barh(places, values, 0.72, xerr=_whiskers(intervals), **look)
+    axis.set_yticks(places, map(style.folded, agents), fontsize=8)
     axis.set_ylim(len(agents) - 0.5, -0.5)
     axis.set(title=PANELS[name][0], xlabel=PANELS[name][1])
     axis.axvline(0.0, color=NEUTRAL, lw=1)
+    axis.grid(visible=False)
+    axis.grid(visible=True, axis="x")
 
 
-def _numbers(rows: Sequence[AgentRow], name: str) -> tuple[list[str], list[Interval], list[str]]:
-    """The agents that have a number, its intervals, and the agents' colours."""
+def _numbers(
+    rows: Sequence[AgentRow], name: str
+) -> tuple[list[str], list[Interval], dict[str, Any]]:
+    """The agents that have a number, its intervals, and how bars look: one of 0 is a line."""
     colours = agent_colours([row.agent for row in rows])
     with_number = list(filter(_has_bias, rows)) if name == "bias" else rows
     agents = [row.agent for row in with_number]
     intervals = [getattr(row, name) for row in with_number]
-    return agents, intervals, [colours[agent] for agent in agents]
+    drawn = [colours[agent] for agent in agents]
+    return agents, intervals, {"color": drawn, "edgecolor": drawn, "error_kw": {"lw": 1}}
 
 
 def _whiskers(intervals: Sequence[Interval]) -> Any:
@@ -434,11 +427,13 @@ def score_panels(table: GapBias) -> list[str]:
         rows = [row for row in table.rows if row.agent != table.baselines[row.agent]]
         if name == "bias" and not any(map(_has_bias, rows)):
             continue
-        if len(table.rows) <= MOST_BESIDE:
+        lines = max(style.folded(row.agent).count("\n") + 1 for row in table.rows)
+        if len(table.rows) <= MOST_BESIDE and lines == 1:
             figure, axes = panels(1, 1, style.PANEL)
             plot_bars(table.rows, axes[0, 0], name)
         else:
-            figure, axes = panels(1, 1, (style.PANEL[0], 1 + LINE * len(table.rows)))
+            height = max(style.PANEL[1], 1 + LINE * lines * len(table.rows))
+            figure, axes = panels(1, 1, (style.PANEL[0], height))
             plot_lines(table.rows, axes[0, 0], name)
         pictures.append(style.svg(figure, name))
     return pictures

@@ -54,8 +54,8 @@ def densities(options: DensityOptions, progress: Progress | None) -> Made:
         else:
             figure, seeds = _curves(measured, masses, bins, options.confidence)
         note = (
-            f"{seeds} x {counts} greedy trajectories (mean length {frames.mean():.0f} frames); "
-            f"decision: {end}"
+            f"{seeds}; {counts} greedy trajectories a run, "
+            f"{frames.mean():.0f} frames long on average; decision: {end}"
         )
         if bins <= BARS_UP_TO:
             note += "; dotted: uniform memory; without memory: all in the most recent part"
@@ -228,7 +228,8 @@ def _curves(measured: Densities, masses: Masses, bins: int, confidence: float) -
             mass = masses.get((agent, game, twin))
             if mass is not None:
                 series[name] = (mass, style.TWIN_COLOURS[twin])
-        plot(series, axis, bins, lengths.get((agent, game), []))
+        twins = list(TWIN_NAMES.values())
+        plot(series, axis, bins, lengths.get((agent, game), []), twins)
         axis.set_title(f"{agent}, {game}")
         in_panel, labels = axis.get_legend_handles_labels()
         handles |= zip(labels, in_panel, strict=True)
@@ -242,31 +243,30 @@ def _curves(measured: Densities, masses: Masses, bins: int, confidence: float) -
 
 
 def plot(
-    series: Mapping[str, tuple[Pooled, str]], axis: Any, bins: int, lengths: Sequence[int] = ()
+    series: Mapping[str, tuple[Pooled, str]],
+    axis: Any,
+    bins: int,
+    lengths: Sequence[int] = (),
+    names: Sequence[str] = (),
 ) -> None:
     """Draw densities over the time of a trajectory, with the reference lines of uniform memory and
-    of none.
+    of none; the lines of ``names``, those of ``series`` by default, look alike in all panels.
     """
     edges = np.arange(bins + 1) / bins
-    for place, (name, (mass, colour)) in enumerate(series.items()):
+    places = list(names or series)
+    for name, (mass, colour) in series.items():
         if np.isfinite(mass.low).all():
             axis.stairs(
                 mass.high, edges, baseline=mass.low, color=colour, alpha=0.22, fill=True, lw=0
             )
-        line = "-" if place % 2 == 0 else (0, (4, 1))
-        axis.stairs(mass.mean, edges, color=colour, label=name, ls=line, lw=1.8)
-    axis.stairs(
-        np.full(bins, 1 / bins), edges, color=style.NEUTRAL, lw=1, ls=":", label="uniform memory"
-    )
+        kind = places.index(name) % len(style.DASHES)
+        look = {"color": colour, "ls": style.DASHES[kind], "lw": 1.8}
+        # broken lines lie on full ones, so that equal lines are all seen
+        axis.stairs(mass.mean, edges, baseline=None, label=name, zorder=2 + kind / 10, **look)
+    thin = {"baseline": None, "color": style.NEUTRAL, "lw": 1}
+    axis.stairs(np.full(bins, 1 / bins), edges, ls=":", label="uniform memory", **thin)
     if len(lengths):
-        axis.stairs(
-            measure.no_memory(lengths, bins),
-            edges,
-            color=style.NEUTRAL,
-            lw=1,
-            ls="-.",
-            label="no memory",
-        )
+        axis.stairs(measure.no_memory(lengths, bins), edges, ls="-.", label="no memory", **thin)
     axis.set(xlim=(0, 1), ylim=(0, 1.05))
 
 
@@ -304,7 +304,7 @@ def recall_density_figure(
     plot(series, axis, bins, lengths)
     axis.set_xlabel("time in the trajectory (1: the decision)")
     axis.set_ylabel(f"share of the gradient in 1/{bins}")
-    style.plain_legend(axis)
+    style.legend_above(figure, axis.get_legend_handles_labels()[0])
     return figure
 
 
@@ -339,10 +339,11 @@ def recall_section(
         for agent, densities in by_agent.items():
             mass = pooled([density.mass(bins) for density in densities])
             series[agent] = (mass, colours[agent])
-        plot(series, axis, bins)
+        plot(series, axis, bins, names=agents)
         axis.set_xlabel("time in the episode (1: the decision)")
 
-    return section("recall density", cells, OF_RUN, _section_row, draw, progress)
+    share = "share of the gradient"
+    return section("recall density", cells, OF_RUN, _section_row, draw, share, progress)
 
 
 def _shortest(densities: Sequence[measure.RecallDensity]) -> int:

@@ -1,6 +1,7 @@
 """Saliency of the last decision of a greedy episode: a row of frames a run, heat over each."""
 
 import math
+import textwrap
 from base64 import b64encode
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -115,9 +116,10 @@ def saliency_figure(
     for part, (title, frames, maps) in zip(parts, rows, strict=True):
         axes = part.subplots(1, columns, squeeze=False)[0]
         peak = plot(frames, maps, axes, white=white)
-        part.suptitle(
-            f"{title}; brightest {peak:.1e}", fontsize="small", x=0.01, ha="left", parse_math=False
-        )
+        look = {"fontsize": "small", "x": 0.01, "ha": "left", "parse_math": False}
+        above = part.suptitle(f"{title}; brightest {peak:.1e}", **look)
+        letters = int(figure.get_figwidth() * 72 / (0.68 * above.get_fontsize()))
+        above.set_text(textwrap.fill(above.get_text(), letters, break_on_hyphens=False))
     return figure
 
 
