@@ -105,7 +105,7 @@ class List(Command):
         games = [make(env_id) for env_id in registered_ids()]
         rows = []
         for game in games:
-            returns = "{:.3g} to {:.3g}".format(*game.return_range)
+            returns = " to ".join(f"{round(end, 3):g}" for end in game.return_range)
             rows.append((game.id, game.max_steps, returns, game.memory_kind or "not said"))
         Table("environments", ("id", "time limit", "return", "the POMDP asks for"), rows).show()
         print(
