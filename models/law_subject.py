@@ -222,3 +222,37 @@ def leaves(state: TensorDict) -> dict[tuple[str, ...], Tensor]:
 def pairs_of(p: TensorDict, q: TensorDict) -> list[tuple[Tensor, Tensor]]:
     """Tensors of two states side by side."""
     return [(leaf, q.get(key)) for key, leaf in leaves(p).items()]
+
+
+def check_state(s: Subject, batch: int, source: str, state: TensorDict) -> None:
+    """Refuse a state from ``source`` whose batch size, or the type of a tensor, is wrong."""
+    if list(state.batch_size) != [batch]:
+        raise MemoryLawError(
+            s.law,
+            f"the state of {source} has batch_size {list(state.batch_size)}, not [{batch}]",
+            "TensorDict(..., batch_size=[B]) is missing, or a tensor does not have the batch "
+            "as its first dimension, such as [layers, B, H] of torch.nn.LSTM",
+        )
+    for path, (_, dtype) in layout_of(state).items():
+        name = ".".join(path)
+        if dtype.is_complex:
+            raise MemoryLawError(
+                s.law,
+                f"{name} of the state is {dtype}, and specs of TorchRL know no complex numbers",
+                "a state that is not taken apart: hold torch.view_as_real(h), and begin forward "
+                "with torch.view_as_complex",
+            )
+        if dtype.is_floating_point and torch.finfo(dtype).eps > torch.finfo(s.dtype).eps:
+            raise MemoryLawError(
+                s.law,
+                f"{name} of the state is {dtype} where the parameters are {s.dtype}",
+                "zeros without a dtype, or a cast: take weight.new_zeros(...)",
+            )
+
+
+def layout_of(state: TensorDict) -> dict[tuple[str, ...], tuple[list[int], torch.dtype]]:
+    """Shape and dtype of the tensors of a state, by path."""
+    layout = {}
+    for path, tensor in leaves(state).items():
+        layout[path] = (list(tensor.shape), tensor.dtype)
+    return layout

@@ -1,14 +1,16 @@
 """The law of the weights of a memory model: registered, made early, and taken by name."""
 
 from contextlib import suppress
+from dataclasses import replace
 from types import FunctionType
 from typing import Any
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torch.nn.parameter import is_lazy
 
-from arcade_torch.models.law_subject import MemoryLawError, Subject, held_by
+from arcade_torch.models.law_subject import MemoryLawError, Subject, check_state, held_by
 
 __all__ = ["weights_are_registered"]
 
@@ -57,8 +59,10 @@ def weights_are_registered(s: Subject) -> float:
     begin = s.initial(2)
     try:
         module(x, begin, torch.zeros_like(x[..., 0], dtype=torch.bool))
-    except Exception:  # the law of shapes calls it too, and looks at the first state before
-        return 0.0
+    except Exception:
+        if isinstance(begin, TensorDictBase):  # forward may have failed by it
+            check_state(replace(s, law="shapes are fixed"), 2, "initial_state(2)", begin)
+        raise
     if new := set(module.state_dict()) - before:
         raise MemoryLawError(
             s.law,

@@ -13,7 +13,14 @@ from arcade_torch.models.law_gradients import (
     gradients_of,
     gradients_of_steps,
 )
-from arcade_torch.models.law_subject import MemoryLawError, Subject, leaves, pairs_of
+from arcade_torch.models.law_subject import (
+    MemoryLawError,
+    Subject,
+    check_state,
+    layout_of,
+    leaves,
+    pairs_of,
+)
 from arcade_torch.models.law_weights import weights_are_registered
 from arcade_torch.models.memory import ReplayableMemory, replay_by_steps
 
@@ -75,7 +82,7 @@ def _check_one_shape(s: Subject, batch: int, steps: int) -> None:
     x = s.random(batch, steps)
     begin = s.initial(batch)
     if isinstance(begin, TensorDictBase):  # before forward, which may fail by it
-        _check_state(s, batch, f"initial_state({batch})", begin)
+        check_state(s, batch, f"initial_state({batch})", begin)
     # a copy: what a module keeps of a call in itself is another law's
     module = s.copied().module
     out = module(x, begin, torch.zeros_like(x[..., 0], dtype=torch.bool))
@@ -133,9 +140,9 @@ def _check_original(s: Subject) -> None:
 
 def _check_states(s: Subject, batch: int, begin: TensorDict, after: TensorDict) -> None:
     """Refuse a state of forward that is no state, or has another layout than the first one."""
-    _check_state(s, batch, "forward", after)
-    expected = _layout(begin)
-    returned = _layout(after)
+    check_state(s, batch, "forward", after)
+    expected = layout_of(begin)
+    returned = layout_of(after)
     if expected != returned:
         raise MemoryLawError(
             s.law,
@@ -143,40 +150,6 @@ def _check_states(s: Subject, batch: int, begin: TensorDict, after: TensorDict) 
             "the state grows, lacks the batch dimension, or does not take dtype and device "
             "from the parameters",
         )
-
-
-def _check_state(s: Subject, batch: int, source: str, state: TensorDict) -> None:
-    """Batch size and dtypes of a state from ``source``."""
-    if list(state.batch_size) != [batch]:
-        raise MemoryLawError(
-            s.law,
-            f"the state of {source} has batch_size {list(state.batch_size)}, not [{batch}]",
-            "TensorDict(..., batch_size=[B]) is missing, or a tensor does not have the batch "
-            "as its first dimension, such as [layers, B, H] of torch.nn.LSTM",
-        )
-    for path, (_, dtype) in _layout(state).items():
-        name = ".".join(path)
-        if dtype.is_complex:
-            raise MemoryLawError(
-                s.law,
-                f"{name} of the state is {dtype}, and specs of TorchRL know no complex numbers",
-                "a state that is not taken apart: hold torch.view_as_real(h), and begin forward "
-                "with torch.view_as_complex",
-            )
-        if dtype.is_floating_point and torch.finfo(dtype).eps > torch.finfo(s.dtype).eps:
-            raise MemoryLawError(
-                s.law,
-                f"{name} of the state is {dtype} where the parameters are {s.dtype}",
-                "zeros without a dtype, or a cast: take weight.new_zeros(...)",
-            )
-
-
-def _layout(state: TensorDict) -> dict[tuple[str, ...], tuple[list[int], torch.dtype]]:
-    """Shape and dtype of the tensors of a state, by path."""
-    layout = {}
-    for path, tensor in leaves(state).items():
-        layout[path] = (list(tensor.shape), tensor.dtype)
-    return layout
 
 
 @torch.no_grad()

@@ -648,7 +648,7 @@ def test_passed_before(model: type[Cell], law: str, said: str) -> None:
         (StateInSelf, "equal calls give equal results", "the module keeps in itself"),
         (Float32State, "shapes are fixed", "h of the state is torch.float32"),
         (ZerosWithoutType, "shapes are fixed", "take weight.new_zeros(...)"),
-        (BatchOfFour, "shapes are fixed", "initial_state(1) has batch_size [4], not [1]"),
+        (BatchOfFour, "shapes are fixed", "initial_state(2) has batch_size [4], not [2]"),
         (NoBatchSize, "shapes are fixed", "has batch_size [], not [1]"),
         (LayersFirst, "shapes are fixed", "such as [layers, B, H]"),
         (WithoutGradient, "nothing leaks over a start", "torch.no_grad"),

@@ -296,7 +296,7 @@ def test_a_worker_stops_when_its_study_is_gone(tmp_path: Path) -> None:
         "from arcade_torch.tools.machine import watch_parent\n"
         "signal.signal(signal.SIGTERM, lambda *_: "
         f"(pathlib.Path({str(tmp_path / 'saved')!r}).touch(), sys.exit()))\n"
-        "watch_parent(every_s=0.05)\n"
+        "watch_parent()\n"
         f"pathlib.Path({str(tmp_path / 'up')!r}).touch()\n"
         "time.sleep(120)\n"
     )
